@@ -21,7 +21,7 @@ from uwblite.drivers.odometry_line import LineFormat, gyro_format, values_by
 from uwblite.drivers.rplidar import RpLidarProtocol
 from uwblite.drivers.scip import ScipProtocol
 from uwblite.drivers.text_lines import LineProtocol
-from uwblite.drivers.uwb_line import BOARDS, by_columns, parse_columns
+from uwblite.drivers.uwb_line import BOARDS, by_columns
 from uwblite.drivers.ydlidar import YdLidarProtocol
 from uwblite.errors import ConfigError
 
@@ -33,7 +33,7 @@ PROTOCOLS = {
     "line": (lambda: LineProtocol(values_by(LineFormat())), WORDS["line"]),
     "create2": (Create2Protocol, WORDS["create2"]),
     "gyro-line": (lambda: LineProtocol(values_by(gyro_format("turn_rate", 1.0, 1.0, ""))), WORDS["line"]),
-    "uwb-line": (lambda: LineProtocol(by_columns(parse_columns("id,range", 1.0, ""))), WORDS["uwb-line"]),
+    "uwb-line": (lambda: LineProtocol(by_columns("id,range")), WORDS["uwb-line"]),
     **{name: (lambda parse=parse: LineProtocol(parse), WORDS[name]) for name, parse in BOARDS.items()},
     "linktrack": (LinkTrackProtocol, WORDS["linktrack"]),
     "bu03": (Bu03Protocol, WORDS["bu03"]),

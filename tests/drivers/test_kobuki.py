@@ -73,7 +73,7 @@ def test_a_packet_byte_by_byte_of_the_protocol_description(others):
     packet = b"\xaa\x55" + bytes([len(payload)]) + payload
     (event,) = feed_whole(KobukiProtocol, packet + bytes([reduce(xor, packet[2:])]), 7.0)
     assert (event.stamp, event.time, event.left, event.right) == (7.0, 4660, 258, 65534)
-    assert (event.bumper, event.wheel_drop, event.battery) == (5, 2, 16.5)
+    assert (event.wheel_drop, event.battery) == (2, 16.5)
     assert event.heading == pytest.approx(-math.pi / 2)
     assert event.turn_rate == pytest.approx(math.radians(12.34))
 
@@ -96,7 +96,7 @@ def test_gyro_of_any_length_and_packets_without_inertia_are_taken():
 
 
 def feedback(k, left, right, heading=0.0, stamp=None):
-    return Feedback(k * 0.02 if stamp is None else stamp, 20 * k % 65536, left % 65536, right % 65536, heading, 0.0, 0, 0, 16.0)
+    return Feedback(k * 0.02 if stamp is None else stamp, 20 * k % 65536, left % 65536, right % 65536, heading, 0.0, 0, 16.0)
 
 
 def drive(packets, start=(0.0, 0.0, 0.0)):

@@ -5,7 +5,7 @@ import pytest
 from uwblite.drivers.events import Corrupt, Note, Send
 from uwblite.drivers.session import Driver, Session, Wait
 
-NOISE = Corrupt(b"?", "noise")
+NOISE = Corrupt("noise")
 
 
 def note(name, text=""):

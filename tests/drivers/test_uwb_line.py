@@ -11,7 +11,7 @@ from uwblite.drivers.devices import open_device
 from uwblite.drivers.events import Corrupt, Lost, Note, RangeEpoch
 from uwblite.drivers.text_lines import LineProtocol
 from uwblite.drivers.uwb_line import BOARDS as FORMS
-from uwblite.drivers.uwb_line import by_columns, parse_columns, sound_lines
+from uwblite.drivers.uwb_line import by_columns, sound_lines
 from uwblite.errors import ConfigError
 
 SPECS = {name: f"{name}:port" for name in BOARDS} | {
@@ -141,14 +141,14 @@ def test_ranges_come_out_as_they_were_measured(name):
     ],
 )
 def test_columns(options, line, expected):
-    ranges = by_columns(parse_columns(options, 1.0, ""))(line)
+    ranges = by_columns(options)(line)
     assert [(r.anchor_id, r.range) for r in ranges.readings] == expected
     assert all(r.quality == 100 for r in ranges.readings)
 
 
 @pytest.mark.parametrize("line", ["A1", "A1 x", "A1 2.5 9", "A/1 2.5", "A1 nan", "A1 1e999"])
 def test_lines_that_do_not_fit_are_damage(line):
-    protocol = LineProtocol(by_columns(parse_columns("id,range", 1.0, "")))
+    protocol = LineProtocol(by_columns("id,range"))
     (event,) = protocol.feed(line.encode() + b"\n", 1.0)
     assert isinstance(event, Corrupt)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from ..drivers.devices import DEVICES, SENSORS, DeviceKind, Setup, kinds_on_usb
 from ..drivers.events import Action, Note, Reopen, Send, SetBaud, SetDtr
+from ..drivers.link import Link
 from ..drivers.session import Session
 from ..drivers.transport import Port, check_url, open_port, plugged_in
 from ..errors import DeviceError
@@ -103,18 +104,15 @@ def look(path: str, kinds: list[DeviceKind], pan_id: int | None) -> PortReport:
 def _ask(port: Port, kind: DeviceKind, seen: PortReport) -> bool:
     """Let a device's session find it; True when it did."""
     driver = kind.driver({}, Setup(stream=False))
-    session, notes = Session(driver), []
+    session, notes = Session(driver), list[Note]()
+    link = Link(kind.sensor, seen.path, session)
+    link.port = port
 
     def do(actions: list[Action]) -> bool:
         for action in actions:
-            if isinstance(action, Send):
-                port.write(action.data)
-            elif isinstance(action, SetBaud):
-                port.set_baud(action.rate)
-            elif isinstance(action, SetDtr):
-                port.set_dtr(action.on)
-            elif isinstance(action, Note):
-                notes.append(action)
+            if isinstance(action, Send | SetBaud | SetDtr):
+                link.send(action)
+        notes.extend(action for action in actions if isinstance(action, Note))
         return not any(isinstance(action, Reopen) for action in actions)
 
     end = time.monotonic() + (LISTEN if kind.talks else ASK)

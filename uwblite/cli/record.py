@@ -43,7 +43,7 @@ def _record(args: argparse.Namespace, path: Path) -> int:
     offset = time.time() - time.monotonic()
     pose, remark = (0.0, 0.0, 0.0), ""
     if args.append and path.exists():
-        last, pose = last_state(_last_part(path))
+        last, pose = last_state(path)
         remark = "goes on with a log that broke off; motion meanwhile is unknown, the odometry goes on from its last pose"
         if last is not None and last > time.monotonic() + offset:
             # A Raspberry Pi without a network wakes with an old clock.
@@ -98,13 +98,6 @@ def _summary(recorder: Recorder, doubts: list[str]) -> dict[str, Any]:
             for link in recorder.links
         },
     }
-
-
-def _last_part(path: Path) -> Path:
-    part = 2
-    while (following := path.with_suffix(f".{part}{path.suffix}")).exists():
-        path, part = following, part + 1
-    return path
 
 
 def _head(args: argparse.Namespace, remark: str) -> list[str]:

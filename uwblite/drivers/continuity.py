@@ -85,12 +85,12 @@ class Continuity(Generic[Item]):
     def confirmed(self, item: Item, witnesses: int, use: Callable[[Item], Iterable[Action]]) -> list[Action]:
         """Return what the readings mean that pass with the next one, and Corrupt for those that are given up."""
         passed, dropped = self.take(item, witnesses)
-        given_up: list[Action] = [Corrupt(b"", f"{self._what} leaps away and back")] * len(dropped)
+        given_up: list[Action] = [Corrupt(f"{self._what} leaps away and back")] * len(dropped)
         return [*given_up, *(action for each in passed for action in use(each))]
 
     def unconfirmed(self) -> list[Action]:
         """Return Corrupt for the readings that still wait at the end."""
-        return [Corrupt(b"", f"{self._what} nothing confirmed")] * len(self.waiting)
+        return [Corrupt(f"{self._what} nothing confirmed")] * len(self.waiting)
 
 
 class LinkHealth:
@@ -142,7 +142,7 @@ class RangeGuard:
         rounds: dict[float, list[Ranged]] = {}
         for item in sorted(passed, key=lambda item: item[0].stamp):
             rounds.setdefault(item[0].stamp, []).append(item)
-        damaged: list[Action] = [Corrupt(b"", "range that leaps away and back, or of an anchor seen once")] * len(given_up)
+        damaged: list[Action] = [Corrupt("range that leaps away and back, or of an anchor seen once")] * len(given_up)
         epochs = (RangeEpoch(t, tuple([reading for _, reading in items]), items[0][0].spread) for t, items in rounds.items())
         return [*damaged, *epochs]
 

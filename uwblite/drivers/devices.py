@@ -26,7 +26,7 @@ from .scip_commands import ScanRequest
 from .scip_driver import ScipDriver
 from .session import Driver, Session
 from .text_lines import LineProtocol
-from .uwb_line import BOARDS, Parse, UwbDriver, by_columns, parse_columns, sound_lines
+from .uwb_line import BOARDS, Parse, UwbDriver, by_columns, sound_lines
 from .ydlidar import YdLidarX2Driver, YdLidarX4Driver
 
 CP2102 = ("10c4:ea60",)
@@ -157,8 +157,7 @@ def _board(parse: Parse, title: str, options: Values) -> Driver:
 
 
 def _uwb_line(options: Values, _setup: Setup) -> Driver:
-    form = parse_columns(options["columns"], options["unit"], options["prefix"])
-    return _board(by_columns(form), "UWB tag that prints lines", options)
+    return _board(by_columns(options["columns"], options["unit"], options["prefix"]), "UWB tag that prints lines", options)
 
 
 def _tag_frames(name: str, title: str, protocol: type[LinkTrackProtocol | Bu03Protocol], usual: int) -> DeviceKind:

@@ -8,41 +8,26 @@ that died, is brought round.
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from . import dwm1001_tlv as tlv
 from .continuity import LinkHealth, RangeGuard
 from .dwm1001_poll import NOT_JOINED, FixPoller
 from .dwm1001_shell import ENTER, PositionLine, Prompt, RangeLine, ShellProtocol, TextLine, node_facts
-from .dwm1001_tlv import (
-    ACTIVE,
-    BAUD,
-    CFG_GET,
-    NODEID_GET,
-    PANID_GET,
-    STATUS_GET,
-    UPD_RATE_GET,
-    VER_GET,
-    NodeConfig,
-    Status,
-    TlvProtocol,
-    UpdateRate,
-    Value,
-    short_id,
-)
 from .events import Action, Corrupt, Lost, Note, Param, RangeEpoch, Reopen, Send
 from .session import Driver, Identity, Script, Wait
 
 DRAIN = 0.25
 PATIENCE, SETTLE = 1.0, 0.25
 """s to wait for an answer during start-up, as the vendor's host does, and after leaving the shell."""
-PROBES = ((STATUS_GET, PATIENCE), (ENTER, 0.6), (STATUS_GET, PATIENCE), (STATUS_GET, PATIENCE), (b"\r", 1.0))
+PROBES = ((tlv.STATUS_GET, PATIENCE), (ENTER, 0.6), (tlv.STATUS_GET, PATIENCE), (tlv.STATUS_GET, PATIENCE), (b"\r", 1.0))
 """What finds out the mode: the status in generic mode; Enter in the shell, which also wakes a sleeping tag."""
 QUIET = 0.15, 0.35
 """s: lines may still come at first; after that, a stream that was stopped must be silent."""
 QUERIES = (
-    (VER_GET, lambda event: _is_value(event, "hardware")),
-    (NODEID_GET, lambda event: _is_value(event, "node_id")),
-    (PANID_GET, lambda event: _is_value(event, "pan_id")),
-    (CFG_GET, lambda event: isinstance(event, NodeConfig)),
-    (UPD_RATE_GET, lambda event: isinstance(event, UpdateRate)),
+    (tlv.VER_GET, lambda event: _is_value(event, "hardware")),
+    (tlv.NODEID_GET, lambda event: _is_value(event, "node_id")),
+    (tlv.PANID_GET, lambda event: _is_value(event, "pan_id")),
+    (tlv.CFG_GET, lambda event: isinstance(event, tlv.NodeConfig)),
+    (tlv.UPD_RATE_GET, lambda event: isinstance(event, tlv.UpdateRate)),
 )
 """What a module is asked once, and what completes the answer."""
 SHORTEST_PERIOD = 0.1
@@ -51,18 +36,18 @@ _BRIDGE = "The USB bridge of the DEV board can hang: unplug it and plug it in ag
 _PORT = "check that the port is the DWM1001's"
 SILENT = Note("error", "uwb-silent", f"uwb: no answer. {_BRIDGE}; {_PORT} and that no other program has it")
 _FOREIGN = "uwb: bytes come, but none that a DWM1001 sends"
-UNREADABLE = Note("error", "uwb-unreadable", f"{_FOREIGN}: {_PORT}, and that it talks at {BAUD} bit/s")
+UNREADABLE = Note("error", "uwb-unreadable", f"{_FOREIGN}: {_PORT}, and that it talks at {tlv.BAUD} bit/s")
 _SHELL = "open a terminal on the port at 115200 bit/s, press Enter twice quickly"
 
 
-def advise(node: NodeConfig, *, joined: bool | None, period: float) -> list[Note]:
+def advise(node: tlv.NodeConfig, *, joined: bool | None, period: float) -> list[Note]:
     """Name every setting that makes ranges rare or absent, the worst first, and how to mend each.
 
     `joined` : the node is part of a network, None = not known yet. `period` : s between fixes.
     """
     resting = f"stationary detection is on: the rate falls to once in 10 s at rest: {_SHELL}, `acts` shows its arguments;"
     resting += " set accel_en to 0, then `reset` (or set `aurs 1 1` to keep 10 Hz at rest)"
-    off, rare = not node.anchor and node.uwb_mode != ACTIVE, period > SHORTEST_PERIOD
+    off, rare = not node.anchor and node.uwb_mode != tlv.ACTIVE, period > SHORTEST_PERIOD
     rows = (
         (node.anchor, "error", "not-a-tag", f"this node is an anchor: {_SHELL}, type `nmt` (it restarts)"),
         (off, "error", "uwb-off", f"the tag's radio is off or passive: {_SHELL}, type `nmt`"),
@@ -77,12 +62,12 @@ def advise(node: NodeConfig, *, joined: bool | None, period: float) -> list[Note
 class Dwm1001Driver(Driver):
     """One DWM1001 tag, by TLV or its `shell`; without `stream` it stops after the queries, for a look at what is plugged in."""
 
-    baud = BAUD
+    baud = tlv.BAUD
 
     def __init__(self, *, shell: bool = False, stream: bool = True) -> None:
-        super().__init__(TlvProtocol(), "DWM1001 tag")
-        self.config: NodeConfig | None = None
-        self.rate: UpdateRate | None = None
+        super().__init__(tlv.TlvProtocol(), "DWM1001 tag")
+        self.config: tlv.NodeConfig | None = None
+        self.rate: tlv.UpdateRate | None = None
         self.values: dict[str, int] = {}
         self.joined: bool | None = None
         self._shell, self._stream = shell, stream
@@ -98,7 +83,7 @@ class Dwm1001Driver(Driver):
 
     def begin(self) -> None:
         """Forget what was half received; the mode is not known."""
-        self._tlv, self._lines = TlvProtocol(), ShellProtocol()
+        self._tlv, self._lines = tlv.TlvProtocol(), ShellProtocol()
         self._text = self._binary = True
         self._streaming = self._heard = False
         self._noise: list[Action] = []
@@ -123,13 +108,13 @@ class Dwm1001Driver(Driver):
     def _learn(self, events: Iterable[Any]) -> None:
         """Remember what the module answers of itself."""
         for event in events:
-            if isinstance(event, NodeConfig):
+            if isinstance(event, tlv.NodeConfig):
                 self.config = event
-            elif isinstance(event, UpdateRate):
+            elif isinstance(event, tlv.UpdateRate):
                 self.rate = event
-            elif isinstance(event, Value):
+            elif isinstance(event, tlv.Value):
                 self.values[event.name] = event.value
-            elif isinstance(event, Status):
+            elif isinstance(event, tlv.Status):
                 self.joined = event.joined
 
     def spacing(self, event: Any) -> float | None:
@@ -186,7 +171,7 @@ class Dwm1001Driver(Driver):
             yield from self.sleep(SETTLE)
         self._text, self._binary = False, True
         self._tlv.reset()
-        return not shell or (yield from self.ask(STATUS_GET, lambda e: isinstance(e, Status), PATIENCE, 4)) is not None
+        return not shell or (yield from self.ask(tlv.STATUS_GET, lambda e: isinstance(e, tlv.Status), PATIENCE, 4)) is not None
 
     def _in_shell(self) -> Script[bool | None]:
         """Return whether the module is in its shell, and quiet; None = no answer."""
@@ -195,7 +180,7 @@ class Dwm1001Driver(Driver):
             yield Send(probe)
             until = self.now + patience
             while (event := (yield Wait(until))) is not None and not left:
-                if isinstance(event, Status):
+                if isinstance(event, tlv.Status):
                     return False
                 if isinstance(event, Prompt):
                     return True
@@ -261,7 +246,7 @@ class Dwm1001Driver(Driver):
         """Name the module in the log, and what of its settings hurts."""
         for name, key in (("uwb_tag_id", "node_id"), ("uwb_pan_id", "pan_id")):
             if key in self.values:
-                yield Param(name, short_id(self.values[key]))
+                yield Param(name, tlv.short_id(self.values[key]))
         if "firmware" in self.values:
             yield Param("uwb_tag_firmware", self._firmware())
         if self.config is not None:
@@ -276,7 +261,7 @@ class Dwm1001Driver(Driver):
         details = {}
         node, network = self.values.get("node_id"), self.values.get("pan_id")
         if node is not None:
-            details["id"] = short_id(node)
+            details["id"] = tlv.short_id(node)
         if network is not None:
             details["network"] = f"0x{network:04X}"
         if "firmware" in self.values:
@@ -295,7 +280,7 @@ class Dwm1001Driver(Driver):
 
 
 def _is_value(event: Any, name: str) -> bool:
-    return isinstance(event, Value) and event.name == name
+    return isinstance(event, tlv.Value) and event.name == name
 
 
 def _source(events: list[Any]) -> str:

@@ -184,7 +184,7 @@ class FixPoller:
                 # Over a slow link the next fix comes before this one is read again: an anchor that is in both is one.
                 self._known |= {r.anchor_id for r in readings} & {r.anchor_id for r in before}
             before = readings
-        yield Corrupt(b"", f"a fix read {READS} times never came twice alike")
+        yield Corrupt(f"a fix read {READS} times never came twice alike")
         return None
 
     def _ask(self, request: bytes, kind: type) -> Script[Any]:
@@ -206,7 +206,7 @@ class FixPoller:
                 yield from self._driver.sleep(SPARSE)
                 return None
         self._failures += 1
-        yield Corrupt(b"", "no answer in time")
+        yield Corrupt("no answer in time")
         self._distrust_until = self._driver.now + DISTRUST
         if not damaged:
             # It may only be late: let it pass, so that it is not taken for the answer to the next request.

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from .dwm1001_tlv import ACTIVE, JOINED, Fact, NodeConfig, Status, UpdateRate, Value
-from .events import Corrupt, RangeReading, corrupt
+from .events import Corrupt, RangeReading
 from .framing import LineReader, RawLine
 
 ENTER = b"\r\r"
@@ -106,9 +106,8 @@ def _parse(line: RawLine) -> list[Event]:
         if isinstance(event, Corrupt):
             broken = broken or event
         elif event is not None:
-            before = line.data[:start]
-            return [*([corrupt(before, "noise before a line")] if before.strip() else []), event]
-    return [broken or corrupt(line.data, "not a line of the shell")]
+            return [*([Corrupt("noise before a line")] if line.data[:start].strip() else []), event]
+    return [broken or Corrupt("not a line of the shell")]
 
 
 Found = tuple[int, Event | None]
@@ -119,7 +118,7 @@ def _find_lec(text: str, stamp_at: StampAt) -> Found:
     start = text.rfind("DIST,")
     if start < 0:
         return 0, None
-    bad = corrupt(text.encode("latin-1"), "lec line cut or garbled")
+    bad = Corrupt("lec line cut or garbled")
     head = re.match(r"DIST,(?:([1-4]),|(0),?$)", text[start:])
     if not head:
         return start, bad
@@ -132,27 +131,27 @@ def _find_lec(text: str, stamp_at: StampAt) -> Found:
         place = row.end()
     if head[1] and (place < len(text) or text.endswith(",")) and not _LEC_END.match(text, place):
         return start, bad
-    return start, _checked(RangeLine(stamp_at(start), tuple(readings), "lec"), text)
+    return start, _checked(RangeLine(stamp_at(start), tuple(readings), "lec"))
 
 
 def _find_les(text: str, stamp_at: StampAt) -> Found:
     match = _LES.search(text)
     if not match:
         cut = "]=" in text or "est[" in text
-        return 0, corrupt(text.encode("latin-1"), "les line cut or garbled") if cut else None
+        return 0, Corrupt("les line cut or garbled") if cut else None
     blocks = list(_BLOCK.finditer(text, match.start(1), match.end(1)))
     ids = [block[1] for block in blocks]
     # A line that broke off runs into the next one: the same anchor again begins the newer line.
     first = max((i + 1 for i, name in enumerate(ids) if name in ids[i + 1 :]), default=0)
     readings = tuple(RangeReading(block[1], float(block[2]), 100) for block in blocks[first:])
     start = blocks[first].start()
-    return start, _checked(RangeLine(stamp_at(start), readings, "les"), text)
+    return start, _checked(RangeLine(stamp_at(start), readings, "les"))
 
 
-def _checked(line: RangeLine, text: str) -> Event:
+def _checked(line: RangeLine) -> Event:
     far = any(reading.range > MAX_RANGE for reading in line.readings)
     if far or len({reading.anchor_id for reading in line.readings}) < len(line.readings):
-        return corrupt(text.encode("latin-1"), "distance or anchors out of range")
+        return Corrupt("distance or anchors out of range")
     return line
 
 
@@ -163,7 +162,7 @@ def _find_position(text: str, stamp_at: StampAt) -> Found:
     # Behind the rows of a broken lec line a position is the end of that line.
     if _LISTENER.match(text, start) or (_POS.match(text, start) and not ("DIST," in text and text[:start].endswith(","))):
         return start, PositionLine(stamp_at(start))
-    return start, corrupt(text.encode("latin-1"), "lep line cut or garbled")
+    return start, Corrupt("lep line cut or garbled")
 
 
 def _find_text(text: str, stamp_at: StampAt) -> Found:

@@ -14,7 +14,7 @@ Sources: DWM1001 firmware API guide 2.3; the vendor's host code.
 import struct
 from dataclasses import dataclass
 
-from .events import Corrupt, RangeReading, corrupt
+from .events import Corrupt, RangeReading
 from .framing import HeadedFrames
 
 BAUD = 115200
@@ -159,7 +159,7 @@ def decode(piece: bytes, stamp: float) -> Event:
     if kind == 0x41:
         x, y, z, quality = _POSITION.unpack(value)
         if quality > 100 or max(abs(x), abs(y), abs(z)) > MAX_PLACE_MM:
-            return corrupt(piece, "position or quality out of range")
+            return Corrupt("position or quality out of range")
         return Position(stamp)
     if kind == 0x45:
         normal, stationary = struct.unpack("<HH", value)
@@ -169,7 +169,7 @@ def decode(piece: bytes, stamp: float) -> Event:
     if kind == 0x5A:
         bits = int.from_bytes(value, "little")
         if bits == _HEAD_AS_STATUS:
-            return corrupt(piece, "the head of an answer instead of a status")
+            return Corrupt("the head of an answer instead of a status")
         return Status(stamp, bits)  # a firmware may set bits that the guide does not name
     if kind in _VALUES:
         return Value(stamp, _VALUES[kind][1], int.from_bytes(value, "little"))
@@ -190,9 +190,9 @@ def _decode_distances(piece: bytes, stamp: float) -> Event:
     else:
         readings, far = list(_ANCHOR_ROW.iter_unpack(rows)), False
     if far or any(distance > MAX_RANGE_MM or quality > 100 for _, distance, quality in readings):
-        return corrupt(piece, "distance or quality out of range")
+        return Corrupt("distance or quality out of range")
     if len({address for address, _, _ in readings}) < len(readings):
-        return corrupt(piece, "one anchor twice in a fix")
+        return Corrupt("one anchor twice in a fix")
     return Distances(stamp, tuple([RangeReading(short_id(a), d / 1000, q) for a, d, q in readings]))
 
 

@@ -11,15 +11,8 @@ from dataclasses import dataclass
 class Corrupt:
     """Bytes that are no frame of the protocol."""
 
-    raw: bytes
-    """The bytes, at most 64 of them."""
     why: str
     """One clause for the counters: what did not fit."""
-
-
-def corrupt(raw: bytes, why: str) -> Corrupt:
-    """Return a Corrupt event that keeps at most the first 64 bytes of what did not fit, and why, one clause."""
-    return Corrupt(bytes(raw[:64]), why)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
-from .events import Corrupt, corrupt
+from .events import Corrupt
 
 CHUNK = 512
 """Bytes looked at together, so that noise of any length is kept at most in pieces of this size."""
@@ -115,7 +115,7 @@ class FrameReader(ABC):
     def _report(self, start: int, end: int, events: list[Any]) -> None:
         start = max(start, self._told)
         if end > start:
-            events.append(corrupt(bytes(self.pending.data[start:end]), self.noise))
+            events.append(Corrupt(self.noise))
 
 
 class HeadedFrames(FrameReader):
@@ -262,19 +262,16 @@ class LineReader:
         self._pending.append(data, stamp)
         offset = 0
         for match in self._ends.finditer(bytes(self._pending.data), begin):
-            cut = offset
-            while match.start() - cut > self._most:
-                lines.append(self._too_long(cut))
-                cut += self._step
+            cut = self._shortened(offset, match.start(), lines)
             text = bytes(self._pending.data[cut : match.start()])
             lines.append(RawLine(text, match[0], self._pending.marks(cut, match.end()), self._cut))
             offset, self._cut = match.end(), False
-        while self.pending - offset > self._most:
-            lines.append(self._too_long(offset))
-            offset += self._step
-        self._pending.drop(offset)
+        self._pending.drop(self._shortened(offset, self.pending, lines))
         return lines
 
-    def _too_long(self, offset: int) -> Corrupt:
-        self._cut = True
-        return corrupt(bytes(self._pending.data[offset : offset + self._step]), "line too long")
+    def _shortened(self, begin: int, end: int, lines: list[RawLine | Corrupt]) -> int:
+        """Return where the part that is kept of a line begins, and note each step of one that is too long."""
+        while end - begin > self._most:
+            lines.append(Corrupt("line too long"))
+            begin, self._cut = begin + self._step, True
+        return begin

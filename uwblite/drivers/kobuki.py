@@ -17,7 +17,7 @@ from operator import xor
 
 from ..clocks.device_clock import BACKWARD, DeviceClock
 from .continuity import Continuity, device_time
-from .events import Action, Corrupt, Lost, OdometryPose, Pose, corrupt
+from .events import Action, Corrupt, Lost, OdometryPose, Pose
 from .framing import HeadedFrames
 from .odometer import BaseDriver, WheelOdometer, way_of
 
@@ -61,8 +61,6 @@ class Feedback:
     """rad, of the gyro, counter-clockwise, wraps at pi; None where the packet has no inertia data."""
     turn_rate: float
     """rad/s."""
-    bumper: int
-    """Bits: 1 right, 2 centre, 4 left."""
     wheel_drop: int
     """Bits: 1 right, 2 left."""
     battery: float
@@ -80,19 +78,19 @@ class KobukiProtocol(HeadedFrames):
 
     def decode(self, frame: bytes, stamp: float) -> Feedback | Corrupt:
         if reduce(xor, frame[2:], 0):
-            return corrupt(frame, "packet with a wrong sum")
+            return Corrupt("packet with a wrong sum")
         subs: dict[int | None, bytes] = {}
         for kind, data in _sub_payloads(frame[3:-1]):
             subs.setdefault(kind, data)
         if None in subs:
-            return corrupt(frame, "packet whose parts do not fill it")
+            return Corrupt("packet whose parts do not fill it")
         basic, inertia = subs[BASIC], subs.get(INERTIA, b"")
-        time, bumper, drop, _cliff, left, right = struct.unpack_from("<HBBBHH", basic)
+        time, _bumper, drop, _cliff, left, right = struct.unpack_from("<HBBBHH", basic)
         heading, rate = None, 0.0
         if len(inertia) >= 4:
             angle, turn = struct.unpack_from("<hh", inertia)
             heading, rate = math.radians(angle / 100), math.radians(turn / 100)
-        return Feedback(stamp, time, left, right, heading, rate, bumper, drop, basic[13] / 10)
+        return Feedback(stamp, time, left, right, heading, rate, drop, basic[13] / 10)
 
 
 def _sub_payloads(payload: bytes) -> Iterator[tuple[int | None, bytes]]:
@@ -131,7 +129,7 @@ class KobukiDriver(BaseDriver):
         self.ready = self._packets > 2
         reading, last, self._last = self._clock.read(event.time, event.stamp), self._last or event, event
         if reading.elapsed is not None and reading.elapsed <= 0:
-            return [Corrupt(b"", "packet sent twice")]
+            return [Corrupt("packet sent twice")]
         restarted = reading.reset and _began_again(last, event)
         if restarted:
             self._odometer.forget()

@@ -13,7 +13,7 @@ decoders (sums).
 import math
 import struct
 
-from .events import Action, Corrupt, Send, corrupt
+from .events import Action, Corrupt, Send
 from .framing import FixedPackets
 from .session import Script
 from .spinning import Fan, Samples, SpinningDriver
@@ -43,7 +43,7 @@ class Lds01Protocol(FixedPackets):
 
     def decode(self, frame: bytes, stamp: float) -> Samples | Corrupt:
         if not self._sum_is_right(frame):
-            return corrupt(frame, "packet with a wrong sum")
+            return Corrupt("packet with a wrong sum")
         (speed,) = struct.unpack_from("<H", frame, 2)
         fields = struct.unpack_from("<" + "HHH" * READINGS, frame, 4)
         first = (frame[1] - FIRST) * READINGS
@@ -79,7 +79,7 @@ class Lds01Driver(SpinningDriver):
         if before is None:
             return []
         step = (event.turned[0] - before.turned[-1]) % 1.0
-        return super().take(before) if step < 1.5 * DEGREE else [Corrupt(b"", "packet before a gap")]
+        return super().take(before) if step < 1.5 * DEGREE else [Corrupt("packet before a gap")]
 
     def start_up(self) -> Script[bool]:
         yield Send(START)

@@ -96,9 +96,7 @@ class LogFile:
         self.head: list[str] = []
         """Lines to repeat at the head of each part."""
         if append:
-            while self._name(self.part + 1).exists():
-                self.part += 1
-            self.path = self._name(self.part)
+            self.path, self.part = _last_part(path)
         elif path.exists():
             raise DataError(f"{path} exists; choose another name, or `append` to go on with it after a crash")
         try:
@@ -108,9 +106,6 @@ class LogFile:
         self._closing, self._dirty = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._keep_syncing, name="uwblite-sync", daemon=True)
         self._thread.start()
-
-    def _name(self, part: int) -> Path:
-        return self.first if part == 1 else self.first.with_suffix(f".{part}{self.first.suffix}")
 
     def _open(self, path: Path) -> int:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
@@ -146,10 +141,10 @@ class LogFile:
             try:
                 self._next_part()
             except OSError as error:
-                raise DataError(f"{self._name(self.part + 1)}: cannot begin the next part ({error.strerror})") from None
+                raise DataError(f"{_part(self.first, self.part + 1)}: cannot begin the next part ({error.strerror})") from None
 
     def _next_part(self) -> None:
-        following, old = self._name(self.part + 1), self._fd
+        following, old = _part(self.first, self.part + 1), self._fd
         self._fd = self._open(following)
         os.write(old, f"COMMENT continued in {following.name}\n".encode())
         os.fdatasync(old)
@@ -200,8 +195,22 @@ class LogFile:
         os.close(self._fd)
 
 
-def last_state(path: Path) -> tuple[float | None, tuple[float, float, float]]:
+def _part(first: Path, part: int) -> Path:
+    """Return the file of a part of a log, counted from 1, by that of the first."""
+    return first if part == 1 else first.with_suffix(f".{part}{first.suffix}")
+
+
+def _last_part(first: Path) -> tuple[Path, int]:
+    """Return the last part of a log that is there, and its number."""
+    part = 1
+    while _part(first, part + 1).exists():
+        part += 1
+    return _part(first, part), part
+
+
+def last_state(first: Path) -> tuple[float | None, tuple[float, float, float]]:
     """Return the largest ipc timestamp near the end of a log of ours, s, and its last odometry; None and zero without any."""
+    path, _ = _last_part(first)
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - TAIL))
         lines = file.read().decode("ascii", "replace").split("\n")[:-1]

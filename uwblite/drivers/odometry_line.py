@@ -7,13 +7,14 @@ There is no standard for what hobby controllers print, so the columns are given:
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from ..clocks.device_clock import DeviceClock
 from ..errors import ConfigError
 from .events import Action, Corrupt, GyroHeading, Note, OdometryPose, Pose
 from .odometer import WheelOdometer, wrapped
-from .text_lines import Line, LineDriver, LineProtocol, columns_of, named_columns, number_of
+from .text_lines import Line, LineDriver, LineProtocol, columns_of, named_columns
 
 LEAP_SPEED, LEAP_TURN = 3.0, 10.0
 """m/s and rad/s that no base of this kind reaches: a line that asks for more is damaged, or the base restarted."""
@@ -63,16 +64,7 @@ def odometry_format(columns: str = "t,x,y,theta", **units: Any) -> LineFormat:
 
 def values_by(line_format: LineFormat) -> Callable[[str], dict[str, float] | str | None]:
     """Return what reads a line as numbers by column, units as printed; a str says why the line is damaged."""
-
-    def parse(line: str) -> dict[str, float] | str | None:
-        values = columns_of(line, line_format.columns, line_format.prefix)
-        if values is None or isinstance(values, str):
-            return values
-        numbers = {name: number for name, text in values.items() if (number := number_of(text)) is not None}
-        wrong = next((name for name in values if name not in numbers), None)
-        return f"column {wrong} is not a number" if wrong else numbers
-
-    return parse
+    return partial(columns_of, columns=line_format.columns, prefix=line_format.prefix)
 
 
 class _ColumnDriver(LineDriver):
@@ -111,7 +103,7 @@ class OdometryLineDriver(_ColumnDriver):
         self.ready, values, unit = True, line.content, self._format
         stamp, elapsed, actions = self.timed(line)
         if elapsed == 0:
-            return [Corrupt(b"", "line sent twice")]
+            return [Corrupt("line sent twice")]
         if self.clock.rate is not None:
             actions += self.say_once(self._wrong_unit(self.clock.rate))
         elif elapsed is None and "t" in values and self._odometer.started:
@@ -178,7 +170,7 @@ class GyroLineDriver(_ColumnDriver):
         self.ready, values = True, line.content
         stamp, elapsed, actions = self.timed(line)
         if elapsed == 0:
-            return [Corrupt(b"", "line sent twice")]
+            return [Corrupt("line sent twice")]
         rate = values.get("turn_rate", 0.0) * self._angle_unit
         if "theta" in values:
             self._heading += math.remainder(values["theta"] * self._angle_unit - self._heading, 2 * math.pi)

@@ -17,28 +17,17 @@ import struct
 from functools import reduce
 from operator import xor
 
+from . import slamtec
 from .events import Action, Corrupt, Send, SetBaud
 from .framing import PacketReader, to_next
 from .session import Script
-from .slamtec import (
-    DESCRIPTOR,
-    HEALTH_REPLY,
-    INFO_REPLY,
-    SYNC,
-    Reply,
-    SlamtecDriver,
-    answers,
-    decode_reply,
-    reply_size,
-    request,
-)
 from .spinning import Fan, Samples
 
 BAUDS = (115200, 256000)
-STOP, STANDARD, INFO, HEALTH, PERIODS = (request(command) for command in (0x25, 0x20, 0x50, 0x52, 0x59))
-EXPRESS = request(0x82, bytes(5))
+STOP, STANDARD, INFO, HEALTH, PERIODS = (slamtec.request(command) for command in (0x25, 0x20, 0x50, 0x52, 0x59))
+EXPRESS = slamtec.request(0x82, bytes(5))
 PERIODS_REPLY, STANDARD_REPLY, EXPRESS_REPLY = 0x15, 0x81, 0x82
-KINDS = {INFO_REPLY: 20, HEALTH_REPLY: 3, PERIODS_REPLY: 4, STANDARD_REPLY: 5, EXPRESS_REPLY: 84}
+KINDS = {slamtec.INFO_REPLY: 20, slamtec.HEALTH_REPLY: 3, PERIODS_REPLY: 4, STANDARD_REPLY: 5, EXPRESS_REPLY: 84}
 CAPSULE, CABINS = 84, 16
 NODE, TOGETHER = 5, 16
 TURN = 360 * 64
@@ -63,7 +52,7 @@ USUAL_SPEED = 660
 
 def motor(speed: int) -> bytes:
     """Return the request that sets the motor's PWM, 0..1023; only adapters of A2 and A3 obey."""
-    return request(0xF0, struct.pack("<H", speed))
+    return slamtec.request(0xF0, struct.pack("<H", speed))
 
 
 class RpLidarProtocol(PacketReader):
@@ -83,28 +72,28 @@ class RpLidarProtocol(PacketReader):
     def reset(self) -> None:
         super().reset()
         self._stream, self._waiting, self._span = 0, None, 0
-        self.smallest = DESCRIPTOR
+        self.smallest = slamtec.DESCRIPTOR
 
-    def feed(self, data: bytes, stamp: float) -> list[Samples | Reply | Corrupt]:
+    def feed(self, data: bytes, stamp: float) -> list[Samples | slamtec.Reply | Corrupt]:
         return [event for event in super().feed(data, stamp) if event is not None]
 
     def is_checked(self, lead: int) -> bool:
-        return lead != SYNC
+        return lead != slamtec.SYNC
 
     def size_at(self, buffer: bytearray, offset: int) -> int:
-        if buffer[offset] == SYNC and (size := reply_size(buffer, offset, KINDS)) >= 0:
+        if buffer[offset] == slamtec.SYNC and (size := slamtec.reply_size(buffer, offset, KINDS)) >= 0:
             return size
         if self._stream == EXPRESS_REPLY:
             return _capsule_size(buffer, offset)
-        return _nodes_size(buffer, offset) if self._stream == STANDARD_REPLY else to_next(buffer, offset, SYNC)
+        return _nodes_size(buffer, offset) if self._stream == STANDARD_REPLY else to_next(buffer, offset, slamtec.SYNC)
 
-    def decode(self, frame: bytes, stamp: float) -> Samples | Reply | None:
+    def decode(self, frame: bytes, stamp: float) -> Samples | slamtec.Reply | None:
         """Decode a capsule, sixteen nodes or a reply; None where a capsule waits for the next one."""
         if len(frame) == CAPSULE:
             return self._capsule(frame, stamp)
         if len(frame) == NODE * TOGETHER:
             return self._nodes(frame, stamp)
-        reply = decode_reply(frame, stamp)
+        reply = slamtec.decode_reply(frame, stamp)
         if reply.kind == PERIODS_REPLY:
             standard, express = struct.unpack("<HH", reply.payload)
             self.periods = (standard * 1e-6, express * 1e-6) if standard and express else self.periods
@@ -179,7 +168,7 @@ def _decode_capsule(capsule: bytes, stamp: float, first: int, step: float, perio
     return Samples(stamp, None, period, tuple(turned), tuple(bearings), tuple(ranges))
 
 
-class RpLidarDriver(SlamtecDriver):
+class RpLidarDriver(slamtec.SlamtecDriver):
     """An RPLIDAR; `express` = 4000 readings a second and more, where the firmware has it (from 1.17)."""
 
     title, dtr = "Slamtec RPLIDAR", False
@@ -199,7 +188,7 @@ class RpLidarDriver(SlamtecDriver):
         return False
 
     def _stream(self) -> Script[bool]:
-        yield from self.ask(PERIODS, answers(PERIODS_REPLY), 0.2)
+        yield from self.ask(PERIODS, slamtec.answers(PERIODS_REPLY), 0.2)
         yield Send(motor(USUAL_SPEED))
         if self._express and (yield from self.begin_stream(EXPRESS, EXPRESS_REPLY)):
             return True

@@ -15,7 +15,7 @@ Range values below DMIN (20 mm) are codes, not distances: see ``scip_commands``,
 import re
 from dataclasses import dataclass
 
-from .events import Corrupt, corrupt
+from .events import Corrupt
 from .framing import LineReader, RawLine
 
 TIME_MODULUS = 1 << 24
@@ -121,7 +121,7 @@ class ScipProtocol:
                 self._take_line(line, events)
                 continue
             if self._frame:
-                events.append(corrupt(self._frame[0][1], "frame with a line too long"))
+                events.append(Corrupt("frame with a line too long"))
                 self._frame = []
             events.append(line)
         return events
@@ -135,7 +135,7 @@ class ScipProtocol:
         if echo:
             self._close(events, cut=True)
             if echo.start():
-                events.append(corrupt(data[: echo.start()], "noise before an echo"))
+                events.append(Corrupt("noise before an echo"))
             self._frame = [(line.stamp_at(echo.start()), data[echo.start() :])]
         elif self._frame:
             self._frame.append((line.stamp_at(0), data))
@@ -146,7 +146,7 @@ class ScipProtocol:
             text = data.decode("ascii", "replace")
             events.append(Reply(line.stamp_at(0), self._text_owner, "00", (_strip_sum(text),)))
         else:
-            events.append(corrupt(data, "line outside a frame"))
+            events.append(Corrupt("line outside a frame"))
 
     def _close(self, events: list[Event], cut: bool = False) -> None:
         """Decode the frame held; `cut` : its closing empty line never came."""
@@ -169,16 +169,15 @@ class ScipProtocol:
 
 def _decode(frame: list[bytes], stamp: float, cut: bool) -> Event:
     """Decode echo, status and lines of one frame."""
-    raw = b"\n".join(frame)
     if cut and frame[0] in (b"VV", b"PP", b"II", b"TM1"):
-        return corrupt(raw, "frame cut off")
+        return Corrupt("frame cut off")
     if len(frame) < 2:
-        return corrupt(raw, "echo without a status")
+        return Corrupt("echo without a status")
     command, status = frame[0], frame[1]
     if len(status) == 1 and status in b"0123456789ABCDE":
         return Reply(stamp, command.decode("ascii"), status.decode("ascii"), tuple(_text(frame[2:])))
     if len(status) != 3 or not status[:2].isalnum() or checksum(status[:2]) != status[2]:
-        return corrupt(raw, "status with a wrong sum")
+        return Corrupt("status with a wrong sum")
     code = status[:2].decode("ascii")
     if (command[:1], code) in ((b"G", "00"), (b"M", "99")):
         return _decode_scan(frame, stamp)
@@ -190,27 +189,26 @@ def _decode(frame: list[bytes], stamp: float, cut: bool) -> Event:
 def _decode_time(frame: list[bytes], stamp: float) -> Event:
     time = frame[2]
     if len(time) != 5 or checksum(time[:4]) != time[4] or time[:4].translate(None, _NOT_DATA) != time[:4]:
-        return corrupt(b"\n".join(frame), "time with a wrong sum")
+        return Corrupt("time with a wrong sum")
     return Reply(stamp, frame[0].decode("ascii"), frame[1][:2].decode("ascii"), (str(decode_number(time[:4])),))
 
 
 def _decode_scan(frame: list[bytes], stamp: float) -> Event:
-    raw = b"\n".join(frame[:2])
     for line in frame[2:]:
         if checksum(line[:-1]) != line[-1]:
-            return corrupt(raw, "data line with a wrong sum")
+            return Corrupt("data line with a wrong sum")
     if len(frame) < 4 or len(frame[2]) != 5:
-        return corrupt(raw, "scan without a time or data")
+        return Corrupt("scan without a time or data")
     data = b"".join([line[:-1] for line in frame[3:]])
     width = 3 if frame[0][1:2] == b"D" else 2
     if data.translate(None, _NOT_DATA) != data or len(data) % width:
-        return corrupt(raw, "data characters lost or foreign")
+        return Corrupt("data characters lost or foreign")
     command = frame[0].decode("ascii").partition(";")[0]
     start, end, cluster = int(command[2:6]), int(command[6:10]), max(1, int(command[10:12]))
     values = decode_values(data, width)
     steps = end - start + 1
     if not steps // cluster <= len(values) <= -(-steps // cluster):
-        return corrupt(raw, f"scan with {len(values)} values instead of {steps // cluster}")
+        return Corrupt(f"scan with {len(values)} values instead of {steps // cluster}")
     remaining = int(command[13:15]) if command[0] == "M" else 0
     return Distances(stamp, command[:2], decode_number(frame[2][:4]), values, start, end, cluster, remaining)
 

@@ -181,7 +181,7 @@ class ScipDriver(ScipUnit):
         if reading.reset:
             yield Note("warning", "lidar-clock-reset", "lidar: its clock was reset; time mapping starts again")
         if reading.elapsed is not None and reading.elapsed < 0.5 * self.period:
-            yield Corrupt(b"", "scan sent twice")
+            yield Corrupt("scan sent twice")
             return
         if reading.missing:
             yield Lost(reading.stamp, reading.missing)

@@ -10,7 +10,7 @@ from typing import Any
 from ..clocks.device_clock import DeviceClock
 from ..errors import ConfigError
 from .continuity import WITNESSES, Continuity, LinkHealth
-from .events import Action, Corrupt, Lost, corrupt
+from .events import Action, Corrupt, Lost
 from .framing import LineReader
 from .session import ByteProtocol, Driver
 
@@ -31,10 +31,10 @@ class Line:
     """What the parser of its lines made of it."""
 
 
-def columns_of(text: str, columns: tuple[str, ...], prefix: str) -> dict[str, str] | str | None:
-    """Return the texts of named columns of a line, parted by commas, semicolons or blanks; ``-`` = skip.
+def columns_of(text: str, columns: tuple[str, ...], prefix: str, words: Collection[str] = ()) -> dict[str, Any] | str | None:
+    """Return the numbers in named columns of a line, of `words` the texts; ``-`` = skip.
 
-    A str says why the line is damaged; None = it has another prefix and is not meant.
+    Columns are parted by commas, semicolons or blanks. A str says why the line is damaged; None = it has another prefix.
     """
     start = text.rfind(prefix) if prefix else 0
     if start < 0:
@@ -42,7 +42,20 @@ def columns_of(text: str, columns: tuple[str, ...], prefix: str) -> dict[str, st
     fields = re.split(r"[,;\s]+", text[start + len(prefix) :].strip(" ,;\t"))
     if len(fields) != len(columns):
         return f"{len(fields)} columns instead of {len(columns)}"
-    return {name: field for name, field in zip(columns, fields, strict=True) if name != "-"}
+    named = ((name, field) for name, field in zip(columns, fields, strict=True) if name != "-")
+    values = {name: field if name in words else _number(field) for name, field in named}
+    wrong = next((name for name, value in values.items() if value is None), None)
+    return f"column {wrong} is not a number" if wrong else values
+
+
+def _number(text: str) -> float | None:
+    """Return the number that a column holds, None = it holds none, or one that nothing counts to."""
+    value = float(text) if NUMBER.fullmatch(text) else math.nan
+    return value if abs(value) < _MOST else None
+
+
+_MOST = 1e18
+"""Nanoseconds since 1970 are below."""
 
 
 def named_columns(text: str, known: Collection[str], what: str) -> tuple[str, ...]:
@@ -60,16 +73,6 @@ def named_columns(text: str, known: Collection[str], what: str) -> tuple[str, ..
         listed = ", ".join(name + "NAME" * name.endswith(":") for name in known)
         raise ConfigError(f"{what}: column {wrong[0]!r}; known are {listed}, - to skip, each once")
     return names
-
-
-def number_of(text: str) -> float | None:
-    """Return the number that a column holds, None = it holds none, or one that nothing counts to."""
-    value = float(text) if NUMBER.fullmatch(text) else math.nan
-    return value if abs(value) < _MOST else None
-
-
-_MOST = 1e18
-"""Nanoseconds since 1970 are below."""
 
 
 _COLOUR = re.compile(rb"\x1b\[[\d;]*m")
@@ -96,7 +99,7 @@ class LineProtocol:
             elif (text := _COLOUR.sub(b"", line.data).strip()) and not line.cut:
                 content = self._content(text)
                 if isinstance(content, str):
-                    events.append(corrupt(text, content))
+                    events.append(Corrupt(content))
                 elif content is not None:
                     events.append(Line(line.stamp_at(0), content))
         return events

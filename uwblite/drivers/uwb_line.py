@@ -16,7 +16,7 @@ from ..errors import ConfigError
 from .continuity import RangeGuard
 from .events import Action, Corrupt, Lost, Note, RangeEpoch, RangeReading
 from .session import ByteProtocol, Identity
-from .text_lines import Line, LineDriver, columns_of, named_columns, number_of
+from .text_lines import Line, LineDriver, columns_of, named_columns
 
 MOST_RANGE = 1000.0
 """m; no UWB radio reaches further."""
@@ -165,51 +165,37 @@ def sound_lines(parse: Parse) -> Parse:
 # ---- boards by columns
 
 
-@dataclass(frozen=True, slots=True)
-class LineColumns:
-    """How to read a line."""
+def by_columns(columns: str, unit: float = 1.0, prefix: str = "") -> Parse:
+    """Return what reads lines by columns, parted by commas, semicolons or blanks.
 
-    columns: tuple[str, ...]
-    """``id``, ``range``, ``range:NAME`` (the range to an anchor that has a column of its own), ``t``, ``quality``, ``tag``;
-    ``-`` = skip."""
-    unit: float = 1.0
-    """m per unit of range."""
-    prefix: str = ""
-    """Text before the columns; lines without it are ignored."""
-
-
-def parse_columns(columns: str, unit: float, prefix: str) -> LineColumns:
-    """Build LineColumns from what a user wrote.
+    Parameters
+    ----------
+    columns : ``id``, ``range``, ``range:NAME`` (the range to an anchor that has a column of its own), ``t``, ``quality``,
+        ``tag``, parted by commas; ``-`` = skip.
+    unit : m per unit of range.
+    prefix : text before the columns; lines without it are ignored.
 
     Raises
     ------
     ConfigError : an unknown column, or no range.
     """
     names = named_columns(columns, ("id", "range", "range:", "t", "quality", "tag"), "uwb line")
-    fixed = [name for name in names if name.startswith("range:")]
+    ranges = [name for name in names if name.startswith("range")]
+    fixed = [name for name in ranges if ":" in name]
     if bad := next((name for name in fixed if not NAME.fullmatch(name[6:])), ""):
         raise ConfigError(f"uwb line: column {bad!r}: NAME in range:NAME is up to 32 letters, digits and _ . : -")
-    if not fixed and not {"id", "range"} <= set(names):
+    if not {"id", "range"} <= set(names) and ("range" in names or not fixed):
         raise ConfigError("uwb line: columns must hold id,range, or one range:NAME for each anchor")
-    return LineColumns(names, unit, prefix)
-
-
-def by_columns(form: LineColumns) -> Parse:
-    """Return what reads lines by columns, parted by commas, semicolons or blanks."""
 
     def parse(line: str) -> Ranges | str | None:
-        values = columns_of(line, form.columns, form.prefix)
+        values = columns_of(line, names, prefix, ("id", "tag"))
         if values is None or isinstance(values, str):
             return values
         if not NAME.fullmatch(values.get("id", "x")):
             return "column id is no name"
-        numbers = {k: number_of(v) for k, v in values.items() if k not in ("id", "tag")}
-        wrong = next((k for k, v in numbers.items() if v is None), None)
-        if wrong:
-            return f"column {wrong} is not a number"
-        quality = numbers.get("quality") or 0.0 if "quality" in numbers else 100.0
-        ranges = [(k[6:] or values["id"], v) for k, v in numbers.items() if k.startswith("range") and v is not None]
-        return Ranges(tuple(reading(k, v * form.unit, quality) for k, v in ranges), numbers.get("t"), values.get("tag", ""))
+        quality = values.get("quality", 100.0)
+        readings = tuple(reading(name[6:] or values["id"], values[name] * unit, quality) for name in ranges)
+        return Ranges(readings, values.get("t"), values.get("tag", ""))
 
     return parse
 
@@ -254,7 +240,7 @@ class UwbDriver(LineDriver):
             return self._ranges(line)
         self._tags[tag] += 1
         if self._tags[tag] == 1:  # its name may be damaged
-            dropped: list[Action] = [Corrupt(b"", OTHER_TAG)] if self._tag or self._first else []
+            dropped: list[Action] = [Corrupt(OTHER_TAG)] if self._tag or self._first else []
             self._first = self._first if self._tag else line
             return dropped
         if self._tag:
@@ -262,7 +248,7 @@ class UwbDriver(LineDriver):
             return self.say_once(Note("warning", "uwb-other-tag", text))
         self._tag, first, self._first = tag, self._first, None
         ours = [first] if first is not None and first.content.tag == tag else []
-        left: list[Action] = [Corrupt(b"", OTHER_TAG)] * (first is not None and not ours)
+        left: list[Action] = [Corrupt(OTHER_TAG)] * (first is not None and not ours)
         return left + [action for each in (*ours, line) for action in self._ranges(each)]
 
     def _ranges(self, line: Line) -> list[Action]:
@@ -286,7 +272,7 @@ class UwbDriver(LineDriver):
         return leap if 0 < step <= NEAR else 0
 
     def stop(self) -> list[Action]:
-        return [*super().stop(), *[Corrupt(b"", OTHER_TAG)] * (self._first is not None), *self._guard.finish()]
+        return [*super().stop(), *[Corrupt(OTHER_TAG)] * (self._first is not None), *self._guard.finish()]
 
     def identity(self) -> Identity:
         return Identity(self.title, (("tag", self._tag),) if self._tag else ())
