@@ -14,7 +14,6 @@ from ..evaluation.map import LandmarkErrors, Landmarks, find_columns, landmark_e
 from ..evaluation.relations import FAR, RelationErrors, Relations, evaluate_relations
 from ..evaluation.trajectory import (
     AnchorErrors,
-    ErrorStatistics,
     Paired,
     TrajectoryErrors,
     evaluate_anchors,
@@ -138,20 +137,21 @@ def _shown_trajectory(t: TrajectoryErrors, true_count: int, title: str) -> Shown
     summary: dict[str, Any] = {"true_poses": true_count, "compared": len(t.matched), "rpe_delta": t.rpe_delta}
     summary |= {"T_truth_map": t.T_truth_map.tolist()}
     summary |= {name: None if errors is None else _plain(errors) for name, errors in named.items()}
-    lines = [f"{title:<24}{'rmse':>11}{'mean':>11}{'median':>11}{'max':>11}", _row("  position (ATE)", t.ate, "m")]
-    if t.heading is not None:
-        lines.append(_row("  heading", t.heading, "deg", _DEGREES))
-    if t.rpe_position is not None and t.rpe_heading is not None:
-        per = f"per {t.rpe_delta:g} m"
-        lines.append(_row("  relative (RPE)", t.rpe_position, f"m {per}"))
-        lines.append(_row("  relative heading", t.rpe_heading, f"deg {per}", _DEGREES))
-    if t.heading is None:
-        lines.append("  the truth has no heading: positions only")
+    per = f"per {t.rpe_delta:g} m"
+    rows = (
+        ("  position (ATE)", t.ate, "m", 1.0),
+        ("  heading", t.heading, "deg", _DEGREES),
+        ("  relative (RPE)", t.rpe_position, f"m {per}", 1.0),
+        ("  relative heading", t.rpe_heading, f"deg {per}", _DEGREES),
+    )
+    lines = [f"{title:<24}{'rmse':>11}{'mean':>11}{'median':>11}{'max':>11}"]
+    lines += [_row(name, (s.rmse, s.mean, s.median, s.max), unit, scale) for name, s, unit, scale in rows if s is not None]
+    lines += ["  the truth has no heading: positions only"] if t.heading is None else []
     return summary, [*lines, f"  {len(t.matched)} of {true_count} true poses compared"]
 
 
-def _row(name: str, s: ErrorStatistics, unit: str, scale: float = 1.0) -> str:
-    return f"{name:<24}" + "".join(f"{scale * v:11.4f}" for v in (s.rmse, s.mean, s.median, s.max)) + f"  {unit}"
+def _row(name: str, values: tuple[float, ...], unit: str, scale: float = 1.0) -> str:
+    return f"{name:<24}" + "".join(f"{scale * value:11.4f}" for value in values) + f"  {unit}"
 
 
 def _shown_relations(errors: RelationErrors, laser_delay: float) -> Shown:
@@ -161,8 +161,8 @@ def _shown_relations(errors: RelationErrors, laser_delay: float) -> Shown:
     summary |= {"translation": _plain(t), "rotation": _plain(r)}
     return summary, [
         f"{'relations':<24}{'mean':>11}{'sd':>11}{'median':>11}{'max':>11}",
-        f"{'  translation':<24}{t.mean:11.4f}{t.std:11.4f}{t.median:11.4f}{t.max:11.4f}  m",
-        f"{'  rotation':<24}" + "".join(f"{_DEGREES * v:11.4f}" for v in (r.mean, r.std, r.median, r.max)) + "  deg",
+        _row("  translation", (t.mean, t.std, t.median, t.max), "m"),
+        _row("  rotation", (r.mean, r.std, r.median, r.max), "deg", _DEGREES),
         f"{count} relations, {missing} not answered; {errors.far:.1%} beyond {FAR:g} m or not answered; "
         f"asked at the lidar's clock {laser_delay:+.3f} s",
     ]

@@ -59,7 +59,7 @@ def _together(files: dict[str, str], folder: str) -> Iterator[dict[str, str]]:
         return
     home = os.path.realpath(folder)
     inside = {what: os.path.basename(name) for what, name in files.items() if os.path.dirname(os.path.realpath(name)) == home}
-    with replacing_folder(folder, (_OWN | set(inside.values())).__contains__) as waiting:
+    with replacing_folder(folder, {*_NAMES.values(), *inside.values()}.__contains__) as waiting:
         yield files | {what: str(waiting / name) for what, name in inside.items()}
 
 
@@ -73,7 +73,12 @@ def _write(places: dict[str, str], localization: Localization, picture: Any, rep
         write_text(places["report"], report)
 
 
-_OWN = {"trajectory.tum", "trajectory_covariance.csv", "path.png", "report.json"}
+_NAMES = {
+    "trajectory": "trajectory.tum",
+    "covariance": "trajectory_covariance.csv",
+    "picture": "path.png",
+    "report": "report.json",
+}
 """What a folder of a localisation holds."""
 _REPORT = '{\n "source": '
 """Beginning of its report, by which it is known."""
@@ -89,9 +94,8 @@ def _files(args: argparse.Namespace) -> dict[str, str]:
         raise ConfigError(f"{args.out} is a file; name a folder, or a trajectory that ends in .tum")
     if os.path.exists(os.path.join(args.out, "map.yaml")):
         raise ConfigError(f"{args.out} holds a map, which a localisation does not replace; choose another folder")
-    names = {"trajectory": "trajectory.tum", "covariance": "trajectory_covariance.csv", "picture": "path.png"}
-    refuse_foreign(unmarked(Path(args.out), _OWN, "report.json", _REPORT))
-    files = {what: os.path.join(args.out, name) for what, name in (names | {"report": "report.json"}).items()}
+    refuse_foreign(unmarked(Path(args.out), _NAMES.values(), _NAMES["report"], _REPORT))
+    files = {what: os.path.join(args.out, name) for what, name in _NAMES.items()}
     return files | {what: name for what in ("covariance", "picture") if (name := getattr(args, what))}
 
 

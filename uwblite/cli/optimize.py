@@ -101,23 +101,18 @@ class _Search:
         """Yield the solutions from starts."""
         starts = iter(starts)
         while self.left > 0.0 and (start := next(starts, None)) is not None:
-            solution = self._solution(start)
-            self.left -= solution.summary.work
-            yield solution
-
-    def _solution(self, start: Start) -> "_Solution":
-        if self.args.robust:
-            return self._reject_outliers(start)
-        return _Solution(*optimize(start.graph, self.config, self.progress, self.left), {}, start)
-
-    def _reject_outliers(self, start: Start) -> "_Solution":
-        graph = start.graph
-        solved, summary, weights = optimize_gnc(graph, outlier_thresholds(graph), self.config, self.progress, self.left)
-        outliers = Counter[str]()
-        for k, weight in weights.items():
-            outliers[type(graph.edges[k]).__name__] += int((weight == 0.0).sum())
-        # The file keeps every edge; which ones were left out is not a property of the measurements.
-        return _Solution(dataclasses.replace(solved, edges=graph.edges), summary, outliers, start)
+            outliers = Counter[str]()
+            if self.args.robust:
+                limits = outlier_thresholds(start.graph)
+                solved, summary, weights = optimize_gnc(start.graph, limits, self.config, self.progress, self.left)
+                for k, weight in weights.items():
+                    outliers[type(start.graph.edges[k]).__name__] += int((weight == 0.0).sum())
+                # The file keeps every edge; which ones were left out is not a property of the measurements.
+                graph = dataclasses.replace(solved, edges=start.graph.edges)
+            else:
+                graph, summary = optimize(start.graph, self.config, self.progress, self.left)
+            self.left -= summary.work
+            yield _Solution(graph, summary, outliers, start)
 
 
 def _figures(file: GraphFile, summary: SolverSummary, lost: list[str]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .. import constraints as known
-from ..config import from_dict, parse_toml
+from ..config import from_dict, parse_toml, to_toml
 from ..constraints import Constraints, GivenAnchor
 from ..errors import ConfigError, FormatError
 from ..sensor_log import MOST_METRES, MOST_SECONDS
@@ -45,6 +45,12 @@ def parse_constraints(text: str, path: str = "") -> Constraints:
         where = f"{path or 'constraints'}: [[{name}]] number"
         entries[field] = tuple(_entry(kind, needed, table, f"{where} {k}") for k, table in enumerate(tables, 1))
     return Constraints(**entries)
+
+
+def constraints_text(constraints: Constraints) -> str:
+    """Return constraints as TOML, such that `parse_constraints` gives them again."""
+    entries = ((name, entry) for name, (_, field, _) in _TABLES.items() for entry in getattr(constraints, field))
+    return "".join(f"\n[[{name}]]\n{to_toml(entry)}" for name, entry in entries)
 
 
 def _entry(kind: type, needed: tuple[str, ...], table: Any, where: str) -> Any:

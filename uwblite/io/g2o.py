@@ -27,20 +27,8 @@ import numpy as np
 from ..arrays import WIDE, Ints, Wides, concatenated
 from ..errors import FormatError
 from ..graph.graph import Graph
+from . import graph_file
 from .files import replacing
-from .graph_file import (
-    ENDS,
-    GraphFile,
-    Measured,
-    Vertices,
-    check_lines,
-    check_planar,
-    measured,
-    measurements,
-    plain_edges,
-    rows_of,
-    upper_triangle,
-)
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
 
@@ -69,7 +57,7 @@ _FROM_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
 """Where dx dy dtheta I11 I12 I13 I22 I23 I33 stand among the numbers of an EDGE2."""
 
 
-def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> GraphFile:
+def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> graph_file.GraphFile:
     """Read a planar pose graph, g2o or TORO, plain or gzip; ``-`` = standard input.
 
     What has no VERTEX line is reached along edges, see graph_file.along_edges.
@@ -85,14 +73,14 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
     with open_source(path) as source:
         content = read_records(source, _LAYOUTS)
     records = content.records
-    check_planar(content)
+    graph_file.check_planar(content)
     toro = replace(records["EDGE2"], numbers=records["EDGE2"].numbers[:, _FROM_TORO])
     steps, vertices = _together(records["EDGE_SE2"], toro), _together(records["VERTEX_SE2"], records["VERTEX2"])
     lines = {kind: records[tag] for kind, tag in _TAGS.items()} | {"relative": steps}
     ids = _ids(content)
     used: dict[str, list[Ints]] = {"pose": [vertices.names], "landmark": [records["VERTEX_XY"].names]}
     for kind, of in lines.items():
-        for place, end in enumerate(ENDS[kind]):
+        for place, end in enumerate(graph_file.ENDS[kind]):
             used[end].append(of.names[:, place : place + 1])
     (pose_ids, pose_of), (landmark_ids, landmark_of) = (_numbered(ids, names) for names in used.values())
     if len(pose_ids) == 0:
@@ -102,22 +90,24 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
     loops = ((of, pose_of[of.names[:, 0]] == pose_of[of.names[:, 1]], _LOOP) for of in (steps, lines["pose_range"]))
     ranged = (lines[kind] for kind in ("range", "pose_range"))
     positive = ((of, ~(of.numbers[:, 1] > 0), "the information of a range must be positive") for of in ranged)
-    check_lines(content, (*loops, *positive))
+    graph_file.check_lines(content, (*loops, *positive))
 
     index = {"pose": pose_of, "landmark": landmark_of}
     try:
-        plain = {kind: measurements(of, kind, index, content, "information") for kind, of in lines.items()}
+        plain = {kind: graph_file.measurements(of, kind, index, content, "information") for kind, of in lines.items()}
     except FormatError as error:
         if error.line is None or error.line not in toro.lines:
             raise
         raise content.error(f"{error.problem} {_ROOTS}", error.line) from None
-    plain["landmark_range"] = measured("landmark_range")
+    plain["landmark_range"] = graph_file.measured("landmark_range")
     fixed = records["FIX"].names[:, 0]
     poses, landmarks = (
-        Vertices(tuple(map(str, ids.tolist())), place, given, place[fixed][place[fixed] >= 0])
+        graph_file.Vertices(tuple(map(str, ids.tolist())), place, given, place[fixed][place[fixed] >= 0])
         for ids, place, given in ((pose_ids, pose_of, vertices), (landmark_ids, landmark_of, records["VERTEX_XY"]))
     )
-    file = GraphFile.of(content, plain, (poses, landmarks), np.arange(len(pose_ids), dtype=np.float64), from_odometry)
+    file = graph_file.GraphFile.of(
+        content, plain, (poses, landmarks), np.arange(len(pose_ids), dtype=np.float64), from_odometry
+    )
     return replace(file, warnings=(*_degrees(steps), *file.warnings))
 
 
@@ -136,7 +126,7 @@ def write_g2o(
     *,
     pose_ids: Sequence[str] = (),
     ranges: bool = False,
-    plain: dict[str, Measured] | None = None,
+    plain: dict[str, graph_file.Measured] | None = None,
 ) -> None:
     """Write a graph for g2o and similar programs: poses, anchors, edges between poses, and the fixed unknowns.
 
@@ -158,7 +148,7 @@ def write_g2o(
         kept = bool(pose_ids) and len(set(names)) == len(names) == len(graph.poses) + len(graph.anchors)
         kept = kept and all(_ID.fullmatch(name.encode()) for name in names)
         number = np.array([int(name) for name in names]) if kept else np.arange(len(graph.poses) + len(graph.anchors))
-        for lines in _lines(graph, plain or plain_edges(graph), ranges, number):
+        for lines in _lines(graph, plain or graph_file.plain_edges(graph), ranges, number):
             stream.write(lines.encode())
         if not kept:
             first = 0 if pose_ids else len(graph.poses)
@@ -166,21 +156,21 @@ def write_g2o(
                 stream.write(f"# vertex {vertex} is {'anchor ' if vertex >= len(graph.poses) else ''}{name}\n".encode())
 
 
-def _lines(graph: Graph, plain: dict[str, Measured], ranges: bool, number: Ints) -> Iterator[str]:
+def _lines(graph: Graph, plain: dict[str, graph_file.Measured], ranges: bool, number: Ints) -> Iterator[str]:
     """Yield the lines of each tag; `number` (poses + anchors,) is the id of each vertex."""
     n, placed = len(graph.poses), np.isfinite(graph.anchors).all(axis=1)
-    yield rows_of("VERTEX_SE2", " %d", [number[:n]], graph.poses)
+    yield graph_file.rows_of("VERTEX_SE2", " %d", [number[:n]], graph.poses)
     first = {"pose": 0, "landmark": n}
     for kind, tag in _TAGS.items():
         if kind == "observation":
-            yield rows_of("VERTEX_XY", " %d", [number[n:][placed]], graph.anchors[placed])
+            yield graph_file.rows_of("VERTEX_XY", " %d", [number[n:][placed]], graph.anchors[placed])
         if ranges or "range" not in kind:
             m = plain[kind]
-            ends = [number[first[end] + index] for end, index in zip(ENDS[kind], m.ends, strict=True)]
-            yield rows_of(tag, " %d" * len(ends), ends, m.value, upper_triangle(m.information))
+            ends = [number[first[end] + index] for end, index in zip(graph_file.ENDS[kind], m.ends, strict=True)]
+            yield graph_file.rows_of(tag, " %d" * len(ends), ends, m.value, graph_file.upper_triangle(m.information))
     fixed = np.flatnonzero(np.append(graph.fixed_poses, graph.fixed_anchors & placed))
     if fixed.tolist() != [0] or len(plain["pose_prior"].value):
-        yield rows_of("FIX", " %d", [number[fixed]], np.zeros((len(fixed), 0)))
+        yield graph_file.rows_of("FIX", " %d", [number[fixed]], np.zeros((len(fixed), 0)))
 
 
 def _together(a: Records, b: Records) -> Records:

@@ -24,19 +24,8 @@ from numpy.typing import NDArray
 
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
+from . import graph_file
 from .files import replacing
-from .graph_file import (
-    ENDS,
-    GraphFile,
-    Measured,
-    Vertices,
-    check_lines,
-    check_planar,
-    measurements,
-    plain_edges,
-    rows_of,
-    upper_triangle,
-)
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
 
@@ -62,7 +51,7 @@ _TAGS = {
 _NAME = re.compile(rb"([A-Za-z])(\d{1,15})")
 
 
-def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> GraphFile:
+def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> graph_file.GraphFile:
     """Read a planar PyFG graph, plain or gzip; ``-`` = standard input.
 
     Parameters
@@ -75,7 +64,7 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
     """
     with open_source(path) as source:
         content = read_records(source, _LAYOUTS)
-    check_planar(content)
+    graph_file.check_planar(content)
     pose_ids, pose_of, landmark_ids, landmark_of = _numbered(content)
     if not pose_ids:
         raise content.error("holds no poses; is this a PyFG file?")
@@ -97,22 +86,22 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
         (vertices, pose_of[vertices.names[:, 0]] < 0, "a pose is named like a landmark"),
         (landmarks, landmark_of[landmarks.names[:, 0]] < 0, "a landmark is named like a pose"),
     )
-    check_lines(content, checks)
+    graph_file.check_lines(content, checks)
 
     index = {"pose": pose_of, "landmark": landmark_of}
     lines = {"relative": steps, "observation": seen, "pose_prior": pinned, "landmark_prior": surveyed, "range": ranged}
     lines |= {"pose_range": meetings, "landmark_range": surveys}
     plain = {}
     for kind, of in lines.items():
-        measured = measurements(of, kind, index, content, "covariance")
+        measured = graph_file.measurements(of, kind, index, content, "covariance")
         inverse, least = _inverted(measured.information)
-        check_lines(content, [(of, ~(least > 0.0), "the covariance matrix is singular")])
+        graph_file.check_lines(content, [(of, ~(least > 0.0), "the covariance matrix is singular")])
         plain[kind] = measured._replace(information=inverse)
     stamps = np.arange(len(pose_ids), dtype=np.float64)
     stamps[ends[:, 1]] = steps.stamps
     stamps[pose_of[vertices.names[:, 0]]] = vertices.stamps
-    named = Vertices(pose_ids, pose_of, vertices), Vertices(landmark_ids, landmark_of, landmarks)
-    return GraphFile.of(content, plain, named, stamps, from_odometry)
+    named = graph_file.Vertices(pose_ids, pose_of, vertices), graph_file.Vertices(landmark_ids, landmark_of, landmarks)
+    return graph_file.GraphFile.of(content, plain, named, stamps, from_odometry)
 
 
 def write_pyfg(
@@ -122,7 +111,7 @@ def write_pyfg(
     stamps: Floats | None = None,
     *,
     pose_ids: Sequence[str] = (),
-    plain: dict[str, Measured] | None = None,
+    plain: dict[str, graph_file.Measured] | None = None,
 ) -> None:
     """Write a graph with its ranges; poses are A0, A1, ... and anchors L0, L1, ... in the order of the graph.
 
@@ -141,7 +130,7 @@ def write_pyfg(
     with replacing(path) as stream:
         poses = _names("A", pose_ids, len(graph.poses), b"[A-KM-Za-z]")
         anchors = _names("L", anchor_ids, len(graph.anchors), b"L")
-        for lines in _lines(graph, plain or plain_edges(graph), stamps, poses, anchors):
+        for lines in _lines(graph, plain or graph_file.plain_edges(graph), stamps, poses, anchors):
             stream.write(lines.encode())
 
 
@@ -155,22 +144,22 @@ def _names(letter: str, names: Sequence[str], count: int, letters: bytes) -> NDA
 
 
 def _lines(
-    graph: Graph, plain: dict[str, Measured], stamps: Floats, poses: NDArray[np.str_], anchors: NDArray[np.str_]
+    graph: Graph, plain: dict[str, graph_file.Measured], stamps: Floats, poses: NDArray[np.str_], anchors: NDArray[np.str_]
 ) -> Iterator[str]:
     """Yield the lines of each tag."""
     first = int(np.argmax(graph.fixed_poses)) if len(graph.poses) else 0
     placed = np.isfinite(graph.anchors).all(axis=1)
-    yield rows_of("VERTEX_SE2", " %.6f %s", [stamps, poses], graph.poses)
-    yield rows_of("VERTEX_XY", " %s", [anchors[placed]], graph.anchors[placed])
+    yield graph_file.rows_of("VERTEX_SE2", " %.6f %s", [stamps, poses], graph.poses)
+    yield graph_file.rows_of("VERTEX_XY", " %s", [anchors[placed]], graph.anchors[placed])
     names = {"pose": poses, "landmark": anchors}
     for kind, tag in _TAGS.items():
         m = plain[kind]
-        ends = [names[end][index] for end, index in zip(ENDS[kind], m.ends, strict=True)]
+        ends = [names[end][index] for end, index in zip(graph_file.ENDS[kind], m.ends, strict=True)]
         # A step is of the time of its end, a range of that of its first pose, what has none of that of the pose that is fixed.
-        indices = [index for end, index in zip(ENDS[kind], m.ends, strict=True) if end == "pose"]
+        indices = [index for end, index in zip(graph_file.ENDS[kind], m.ends, strict=True) if end == "pose"]
         when = stamps[indices[-1 if kind == "relative" else 0]] if indices else np.full(len(m.value), stamps[first])
-        covariances = upper_triangle(_inverted(m.information)[0])
-        yield rows_of(tag, " %.6f" + " %s" * len(ends), [when, *ends], m.value, covariances)
+        covariances = graph_file.upper_triangle(_inverted(m.information)[0])
+        yield graph_file.rows_of(tag, " %.6f" + " %s" * len(ends), [when, *ends], m.value, covariances)
 
 
 def _inverted(matrices: Floats) -> tuple[Floats, Floats]:

@@ -135,13 +135,21 @@ def open_source(path: str | os.PathLike[str], digest: "hashlib._Hash | None" = N
     digest : takes the bytes as stored, where several files are hashed together.
     """
     name = os.fspath(path)
+    with opened(name) as stream:
+        try:
+            yield TextSource(stream, "stdin" if name == "-" else name, digest)
+        except EOFError:
+            raise FormatError("the gzip data is cut off; copy the file again, or save what zcat can read", name) from None
+        except (gzip.BadGzipFile, zlib.error) as error:
+            raise FormatError(f"the gzip data is damaged ({error}); copy it again, or save what zcat can read", name) from None
+
+
+@contextmanager
+def opened(name: str) -> Iterator[BinaryIO]:
+    """Open a file, a pipe or standard input (``-``), which is not closed; raise FormatError where it cannot be read."""
     stream = open_input(name)
     try:
-        yield TextSource(stream, "stdin" if name == "-" else name, digest)
-    except EOFError:
-        raise FormatError("the gzip data is cut off; copy the file again, or save what zcat can read", name) from None
-    except (gzip.BadGzipFile, zlib.error) as error:
-        raise FormatError(f"the gzip data is damaged ({error}); copy it again, or save what zcat can read", name) from None
+        yield stream
     except OSError as error:
         raise FormatError(f"cannot be read: {error.strerror or error}", name) from None
     finally:
@@ -175,11 +183,8 @@ def open_input(name: str) -> BinaryIO:
 
 def read_bounded(name: str, most: int) -> bytes:
     """Return the bytes of a small file; raise FormatError where it cannot be read, or holds more than `most`."""
-    with open_input(name) as stream:
-        try:
-            data = stream.read(most + 1)
-        except OSError as error:
-            raise FormatError(f"cannot be read: {error.strerror or error}", name) from None
+    with opened(name) as stream:
+        data = stream.read(most + 1)
     if len(data) > most:
         size = f"{most / 1e6:.0f} MB" if most >= 1e6 else f"{most / 1e3:.0f} kB"
         raise FormatError(f"is larger than {size}, far too large for what it should be", name)

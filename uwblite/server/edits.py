@@ -3,7 +3,6 @@
 The file may hold constraints of the user's own. They stay as they are, above a line that marks where the page's begin.
 """
 
-import json
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +11,7 @@ from typing import Any
 
 from ..constraints import Constraints, ForbiddenClosure, GivenAnchor, GivenClosure
 from ..errors import ConfigError
-from ..io.constraints_file import parse_constraints
+from ..io.constraints_file import constraints_text, parse_constraints
 from ..io.stored_result import StoredClosure
 
 MARK = "# Below this line: made by uwblite view, which writes it again. Constraints of your own belong above."
@@ -47,14 +46,8 @@ def parse_edits(text: str, path: str = "") -> tuple[str, Constraints]:
 
 def edits_text(own: str, edits: Constraints) -> str:
     """Return the constraints file: the user's own part, the mark, and the page's tables."""
-    parts = [f"{own.rstrip()}\n\n{MARK}\n" if own.strip() else f"{MARK}\n"]
-    for a in edits.anchors:
-        parts.append(f"\n[[anchor]]\nid = {json.dumps(a.id)}\nposition = {_numbers(a.position)}\nsigma = {a.sigma!r}\n")
-    for c in edits.closures:
-        parts.append(f"\n[[closure]]\n{_ends(c)}pose = {_numbers(c.pose)}\nsigma = {_numbers(c.sigma)}\n")
-    for f in edits.forbidden:
-        parts.append(f"\n[[forbidden_closure]]\n{_ends(f)}within = {f.within!r}\n")
-    return "".join(parts)
+    head = f"{own.rstrip()}\n\n" if own.strip() else ""
+    return f"{head}{MARK}\n{constraints_text(edits)}"
 
 
 def with_closure(edits: Constraints, closure: StoredClosure, wish: str) -> Constraints:
@@ -98,14 +91,6 @@ def wish_for(edits: Constraints, closure: StoredClosure) -> str:
 def _same(one: GivenClosure | ForbiddenClosure, closure: StoredClosure) -> bool:
     near = all(abs(a - b) < _SAME for a, b in zip(one.stamps, closure.stamps, strict=True))
     return near and tuple(one.recordings) == closure.recordings
-
-
-def _ends(c: GivenClosure | ForbiddenClosure) -> str:
-    return f"stamps = {_numbers(c.stamps)}\nrecordings = [{c.recordings[0]}, {c.recordings[1]}]\n"
-
-
-def _numbers(values: tuple[float, ...]) -> str:
-    return "[" + ", ".join(repr(float(v)) for v in values) + "]"
 
 
 def remap_command(report: dict[str, Any], folder: Path, recordings: dict[str, Path], constraints: Path, out: Path) -> list[str]:
