@@ -77,54 +77,45 @@ class SweepAssembler:
         self.clear()
 
     def clear(self) -> None:
-        self._last: tuple[float, float] | None = None
-        self._turned: list[float] = []
-        self._times: list[float] = []
-        self._bearings: list[float] = []
-        self._ranges: list[float] = []
+        self._turn: list[tuple[float, float, float, float]] = []
+        """Time, place of the motor, bearing and range of each reading of this turn."""
         self._begin: float | None = None
         self._before: tuple[float, float] | None = None
+        """Bearing and range of the last reading before it."""
 
     def add(self, times: list[float], samples: Samples) -> list[LaserScan]:
         """Take readings made at times, s, host clock; return the scans of the turns that ended."""
         scans = []
-        for time, turned, bearing, reach in zip(times, samples.turned, samples.bearings, samples.ranges, strict=True):
-            if self._last is not None and turned < self._last[1] - BACKLASH:
+        for reading in zip(times, samples.turned, samples.bearings, samples.ranges, strict=True):
+            time, turned, bearing, reach = reading
+            if self._turn and turned < self._turn[-1][1] - BACKLASH:
                 seam = self._seam(time, turned)
-                scan = self._close(seam, (bearing + 1.0, reach))
-                if scan is not None:
+                if (scan := self._close(seam, (bearing + 1.0, reach))) is not None:
                     scans.append(scan)
-                self._before = (self._bearings[-1] - 1.0, self._ranges[-1]) if self._bearings else None
-                self._turned, self._times, self._bearings, self._ranges = [], [], [], []
-                self._begin = seam
-            self._last = (time, turned)
-            self._turned.append(turned)
-            self._times.append(time)
-            self._bearings.append(bearing)
-            self._ranges.append(reach)
+                self._before = (self._turn[-1][2] - 1.0, self._turn[-1][3])
+                self._turn, self._begin = [], seam
+            self._turn.append(reading)
         return scans
 
     def _seam(self, time: float, turned: float) -> float:
         """Return when the motor passed zero between the last reading and this one, s."""
-        assert self._last is not None
-        before, angle = self._last
+        before, angle = self._turn[-1][:2]
         return before + (time - before) * (1.0 - angle) / (1.0 - angle + turned) if turned + 1.0 > angle else time
 
     def _close(self, end: float, after: tuple[float, float]) -> LaserScan | None:
         begin = self._begin
-        if begin is None or len(self._turned) < 2 or end <= begin:
+        if begin is None or len(self._turn) < 2 or end <= begin:
             return None
-        fan, spacing = self.fan, 1.0 / self.fan.rays
-        rays = sorted(zip(self._bearings, self._ranges, strict=True))
+        fan, spacing, duration = self.fan, 1.0 / self.fan.rays, end - begin
+        rays = sorted((bearing, reach) for _, _, bearing, reach in self._turn)
         rays = [*([self._before] if self._before else []), *rays, after]
         ranges, known = _resample(rays, fan.rays, spacing)
-        uneven = max(abs(time - begin - turned * (end - begin)) for time, turned in zip(self._times, self._turned, strict=True))
-        if known < LEAST_RAYS * fan.rays or uneven > UNEVEN * (end - begin):
+        uneven = max(abs(time - begin - turned * duration) for time, turned, _, _ in self._turn)
+        if known < LEAST_RAYS * fan.rays or uneven > UNEVEN * duration:
             self.lost += 1
             return None
         # The reading that points at ray 0 is made a little before or after the motor passes zero.
-        ahead = sum(t - b for t, b in zip(self._turned, self._bearings, strict=True)) / len(self._turned)
-        duration = end - begin
+        ahead = sum(turned - bearing for _, turned, bearing, _ in self._turn) / len(self._turn)
         if abs(duration - self._duration) > STEADY * duration:
             self._duration = duration
         middle = 0.5 * (begin + end) + ahead * duration

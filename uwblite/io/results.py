@@ -18,7 +18,6 @@ from ..report.html import Heading, render
 from ..report.picture import draw_map
 from ..report.printable import duration
 from ..sensor_log import SensorLog
-from . import result_text
 from .files import sha256_of, write_text
 from .folders import check_free, refuse_foreign, replacing_folder
 from .g2o import write_g2o
@@ -26,6 +25,18 @@ from .graph_file import plain_edges
 from .map_server import trinary_image, write_map
 from .png import encode_png, write_png
 from .pyfg import write_pyfg
+from .result_text import (
+    RunRecord,
+    anchors_csv,
+    base_name,
+    covariance_csv,
+    json_lines,
+    range_errors_csv,
+    recording_figures,
+    settings_line,
+    stamps_csv,
+    summary,
+)
 from .stored_result import is_of_result, repair_result
 from .tum import write_tum
 
@@ -56,9 +67,7 @@ def _is_written(folder: Path, name: str) -> bool:
         return not (folder / name).exists()
 
 
-def write_result(
-    folder: str | os.PathLike[str], logs: Sequence[SensorLog], result: MapResult, record: result_text.RunRecord
-) -> list[str]:
+def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], result: MapResult, record: RunRecord) -> list[str]:
     """Write a result into a folder, made where it is missing, in place of an earlier one, untouched where an error is raised.
 
     Parameters
@@ -75,11 +84,11 @@ def write_result(
             chosen, name = result.recording == number, f"trajectory_{number + 1}.tum" if number else "trajectory.tum"
             write_tum(waiting / name, result.stamps[chosen], result.trajectory[chosen])
         stamps, recording = result.keyframe_stamps, result.keyframe_recording
-        table = result_text.covariance_csv(stamps, result.keyframe_covariances, recording, result.trusted(stamps, recording))
+        table = covariance_csv(stamps, result.keyframe_covariances, recording, result.trusted(stamps, recording))
         write_text(waiting / "trajectory_covariance.csv", table)
-        write_text(waiting / "anchors.csv", result_text.anchors_csv(result))
+        write_text(waiting / "anchors.csv", anchors_csv(result))
         if result.range_table:
-            write_text(waiting / "range_errors.csv", result_text.range_errors_csv(result))
+            write_text(waiting / "range_errors.csv", range_errors_csv(result))
         grid_png = None
         if result.grid is not None:
             write_map(waiting, result.grid)
@@ -90,13 +99,13 @@ def write_result(
         ids, plain = tuple(a.id for a in result.anchors), plain_edges(result.graph)
         write_g2o(waiting / "graph.g2o", result.graph, plain=plain)
         write_pyfg(waiting / "graph.pyfg", result.graph, ids, result.keyframe_stamps, plain=plain)
-        write_text(waiting / "graph_stamps.csv", result_text.stamps_csv(result))
+        write_text(waiting / "graph_stamps.csv", stamps_csv(result))
         write_text(waiting / "config.toml", record.config)
         heading = Heading(_title(logs), record.command, _lead(logs, result), _facts(logs, result, record))
         page = render(result, heading, grid_png)
         write_text(waiting / "report.html", page)
         hashes = {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(waiting.iterdir())}
-        write_text(waiting / "report.json", result_text.json_lines(result_text.summary(logs, result, record, hashes)))
+        write_text(waiting / "report.json", json_lines(summary(logs, result, record, hashes)))
         names = sorted((p.name for p in waiting.iterdir()), key=_order)
     return names
 
@@ -107,12 +116,12 @@ def _order(name: str) -> tuple[int, str]:
 
 
 def _title(logs: Sequence[SensorLog]) -> str:
-    return ", ".join(result_text.base_name(log.notes.source) or "recording" for log in logs)
+    return ", ".join(base_name(log.notes.source) or "recording" for log in logs)
 
 
 def _caption(logs: Sequence[SensorLog], result: MapResult) -> str:
     """Return what the picture shows in a line: a name alone, mostly run.log, means nothing."""
-    sums, kept = result_text.recording_figures(logs, result), sum(c.accepted for c in result.closures)
+    sums, kept = recording_figures(logs, result), sum(c.accepted for c in result.closures)
     driven = f"{sums['travelled']:.0f} m in {duration(sums['duration'])}"
     counts = f"{driven}, {len(result.anchors)} anchors, {kept} closures"
     return f"{_title(logs[:2])}{' ...' if len(logs) > 2 else ''}: {counts}"
@@ -120,7 +129,7 @@ def _caption(logs: Sequence[SensorLog], result: MapResult) -> str:
 
 def _lead(logs: Sequence[SensorLog], result: MapResult) -> str:
     """Return recording and map in a line."""
-    sums, kept = result_text.recording_figures(logs, result), sum(c.accepted for c in result.closures)
+    sums, kept = recording_figures(logs, result), sum(c.accepted for c in result.closures)
     driven = f"{duration(sums['duration'])}, {sums['travelled']:.1f} m, {sums['ranges']} ranges, {sums['scans']} scans"
     closures, size = f"{kept} of {len(result.closures)} loop closures" if result.closures else "", ""
     if result.grid is not None:
@@ -129,7 +138,7 @@ def _lead(logs: Sequence[SensorLog], result: MapResult) -> str:
     return "; ".join(filter(None, (driven, size, closures)))
 
 
-def _facts(logs: Sequence[SensorLog], result: MapResult, record: result_text.RunRecord) -> tuple[tuple[str, str], ...]:
+def _facts(logs: Sequence[SensorLog], result: MapResult, record: RunRecord) -> tuple[tuple[str, str], ...]:
     versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
-    facts = (("settings", result_text.settings_line(record.preset, record.changed)), ("made by", versions))
+    facts = (("settings", settings_line(record.preset, record.changed)), ("made by", versions))
     return tuple((name, value) for name, value in (*(("sha256", log.notes.sha256) for log in logs), *facts) if value)
