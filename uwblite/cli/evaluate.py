@@ -41,20 +41,12 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--anchors and --landmarks need --truth, which lays the map over them")
     if args.recording and len(args.truth or ()) > 1:
         raise ConfigError("--recording is for a single --truth; several are of recording 1, 2, ...")
-    console.report(args.json, *compare(args))
-    return 0
-
-
-def compare(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     folder = Path(args.dir)
     repair_result(folder)
-    summary: dict[str, Any] = {}
-    lines: list[str] = []
-    for name, figures, text in _comparisons(args, folder):
-        if name:
-            summary[name] = figures
-        lines += text
-    return summary, lines
+    comparisons = list(_comparisons(args, folder))
+    summary = {name: figures for name, figures, _ in comparisons if name}
+    console.report(args.json, summary, [line for _, _, lines in comparisons for line in lines])
+    return 0
 
 
 def _comparisons(args: argparse.Namespace, folder: Path) -> Iterator[tuple[str, Any, list[str]]]:

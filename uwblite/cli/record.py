@@ -15,7 +15,7 @@ from ..drivers.events import Note, Pose
 from ..drivers.link import Host, Link, Mounting
 from ..drivers.log_file import LogFile, last_state
 from ..drivers.recorder import Recorder
-from ..drivers.transport import absent_port, check_pyserial, check_url, stable_name
+from ..drivers.transport import absent_port, check_url, is_socket, pyserial, stable_name
 from ..errors import ConfigError, DeviceError
 from ..io.folders import sole_writer
 from .child import Child
@@ -171,7 +171,8 @@ def device_links(args: argparse.Namespace, pose: Pose = (0.0, 0.0, 0.0)) -> list
             links.append(Link(sensor, url, session, k))
     for link in links:
         check_url(link.url)
-        check_pyserial(link.url)
+        if not is_socket(link.url):
+            pyserial()
     return links
 
 

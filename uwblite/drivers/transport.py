@@ -51,12 +51,6 @@ _KINDS = ("alt", "cp2110", "hwgrep", "loop", "rfc2217", "socket", "spy")
 """URLs that pyserial opens; sockets are opened here."""
 
 
-def check_pyserial(url: str) -> None:
-    """Raise DeviceError if the port needs pyserial and it is not installed."""
-    if not is_socket(url):
-        pyserial()
-
-
 def is_socket(url: str) -> bool:
     return url.lower().startswith("socket://")
 

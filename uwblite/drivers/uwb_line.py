@@ -38,12 +38,8 @@ class Ranges:
     """It wraps there; 0 = it does not."""
 
 
-@dataclass(frozen=True, slots=True)
 class Refused:
-    """A line that holds something else than ranges."""
-
-    what: str
-    """Clause for people."""
+    """A line that holds positions or angles, and no ranges."""
 
 
 Parse = Callable[[str], Ranges | Refused | str | None]
@@ -73,7 +69,7 @@ def _each(whole: str, row: str, part: str, unit: float = 1.0, number: str = "$^"
             return Ranges(ranges, round=int(stated[1]) if stated else None)
         if part_form.search(line):
             return DAMAGED
-        return Refused("positions or angles") if _NO_RANGE.search(line) else None
+        return Refused() if _NO_RANGE.search(line) else None
 
     return parse
 
@@ -233,7 +229,7 @@ class UwbDriver(LineDriver):
 
     def measured(self, line: Line) -> list[Action]:
         if isinstance(line.content, Refused):
-            text = f"uwb: it prints {line.content.what}, which are no ranges: set it to two-way ranging, and to print distances"
+            text = "uwb: it prints positions or angles, which are no ranges: set it to two-way ranging, and to print distances"
             return self.say_once(Note("error", "uwb-no-ranges", text))
         tag = line.content.tag
         if not tag or tag == self._tag:

@@ -11,6 +11,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -98,12 +99,15 @@ def _uint32(raw: bytes) -> int:
 
 def _fields(head: bytes) -> dict[bytes, bytes]:
     """Return the fields of a record's header."""
-    fields, place = dict[bytes, bytes](), 0
-    while place < len(head):
-        end = place + 4 + _uint32(head[place : place + 4])
-        name, _, fields[name] = head[place + 4 : end].partition(b"=")
+    return {name: value for name, _, value in (field.partition(b"=") for field in _pieces(head))}
+
+
+def _pieces(data: bytes, place: int = 0) -> Iterator[bytes]:
+    """Yield the pieces of data from a place on, each of which stands behind its length."""
+    while place < len(data):
+        end = place + 4 + _uint32(data[place : place + 4])
+        yield data[place + 4 : end]
         place = end
-    return fields
 
 
 def _of_mcap(stream: BinaryIO, size: int, add: Add, schemas: dict[int, tuple[str, Any]] | None = None) -> Iterator[Message]:
@@ -122,10 +126,10 @@ def _of_mcap(stream: BinaryIO, size: int, add: Add, schemas: dict[int, tuple[str
         elif len(data) < length or kind in (0x00, 0x02, 0x0F):  # zeros, footer, end of the data
             return
         elif kind == 0x03:
-            name, form, text = _strings(data, 2, 3)
+            name, form, text = (piece.decode() for piece in islice(_pieces(data, 2), 3))
             schemas[_uint16(data)] = name, MessageDefinition(formats.get(form, Form.NONE), text)
         elif kind == 0x04:
-            add(_uint16(data), _strings(data, 4, 1)[0], *schemas[_uint16(data[2:])])
+            add(_uint16(data), next(_pieces(data, 4)).decode(), *schemas[_uint16(data[2:])])
         elif kind == 0x05:
             channel, _, time = struct.unpack_from("<HIQ", data)
             yield channel, time, data[22:]
@@ -133,16 +137,6 @@ def _of_mcap(stream: BinaryIO, size: int, add: Add, schemas: dict[int, tuple[str
 
 def _uint16(raw: bytes) -> int:
     return int(struct.unpack_from("<H", raw)[0])
-
-
-def _strings(data: bytes, start: int, count: int) -> list[str]:
-    """Return so many texts, each behind its length."""
-    texts = []
-    for _ in range(count):
-        end = start + 4 + _uint32(data[start : start + 4])
-        texts.append(data[start + 4 : end].decode())
-        start = end
-    return texts
 
 
 def _unpacked(compression: bytes, data: bytes) -> bytes:

@@ -92,22 +92,18 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> gr
     positive = ((of, ~(of.numbers[:, 1] > 0), "the information of a range must be positive") for of in ranged)
     graph_file.check_lines(content, (*loops, *positive))
 
-    index = {"pose": pose_of, "landmark": landmark_of}
-    try:
-        plain = {kind: graph_file.measurements(of, kind, index, content, "information") for kind, of in lines.items()}
-    except FormatError as error:
-        if error.line is None or error.line not in toro.lines:
-            raise
-        raise content.error(f"{error.problem} {_ROOTS}", error.line) from None
-    plain["landmark_range"] = graph_file.measured("landmark_range")
     fixed = records["FIX"].names[:, 0]
     poses, landmarks = (
         graph_file.Vertices(tuple(map(str, ids.tolist())), place, given, place[fixed][place[fixed] >= 0])
         for ids, place, given in ((pose_ids, pose_of, vertices), (landmark_ids, landmark_of, records["VERTEX_XY"]))
     )
-    file = graph_file.GraphFile.of(
-        content, plain, (poses, landmarks), np.arange(len(pose_ids), dtype=np.float64), from_odometry
-    )
+    numbers = np.arange(len(pose_ids), dtype=np.float64)
+    try:
+        file = graph_file.GraphFile.of(content, lines, (poses, landmarks), numbers, "information", from_odometry)
+    except FormatError as error:
+        if error.line is None or error.line not in toro.lines:
+            raise
+        raise content.error(f"{error.problem} {_ROOTS}", error.line) from None
     return replace(file, warnings=(*_degrees(steps), *file.warnings))
 
 

@@ -172,18 +172,28 @@ class GraphFile:
 
     @staticmethod
     def of(
-        content: RecordFile, plain: dict[str, Measured], of: tuple["Vertices", "Vertices"], stamps: Floats, odometry: bool
+        content: RecordFile,
+        lines: dict[str, Records],
+        of: tuple["Vertices", "Vertices"],
+        stamps: Floats,
+        matrix: str,
+        odometry: bool,
     ) -> "GraphFile":
         """Return the graph of a file that was read, with a start for whatever the file gives no position of.
 
         Parameters
         ----------
-        of : poses and landmarks, stamps : (n,) s, of the poses. odometry : forget the positions that the file gives.
+        lines : by kind of measurement. of : poses and landmarks. stamps : (n,) s, of the poses.
+        matrix : 'information' or 'covariance', on the lines. odometry : forget the positions that the file gives.
 
         Raises
         ------
-        FormatError : a pose is connected with nothing, or a vertex is given twice.
+        FormatError : a matrix is none of its kind, a pose is connected with nothing, or a vertex is given twice.
         """
+        index = {"pose": of[0].place, "landmark": of[1].place}
+        plain = {
+            kind: measurements(lines[kind], kind, index, content, matrix) if kind in lines else measured(kind) for kind in ENDS
+        }
         graph, (pose_ids, anchor_ids) = _assembled(content, plain, *of), (vertices.ids for vertices in of)
         started, chains = along_edges(graph)
         file = GraphFile(started, pose_ids, anchor_ids, stamps, chains, dict(sorted(content.skipped.items())))
@@ -293,11 +303,11 @@ def measurements(of: Records, kind: str, index: dict[str, Ints], content: Record
 
     Parameters
     ----------
-    index : place of each name of the file among poses, and among landmarks. what : the kind of matrix.
+    index : place of each name of the file among poses, and among landmarks. what : 'information' or 'covariance'.
 
     Raises
     ------
-    FormatError : a matrix has a negative eigenvalue.
+    FormatError : a matrix has a negative eigenvalue, or is a singular covariance.
     """
     k = WIDTHS.get(kind, 1)
     ends = tuple(index[end][of.names[:, n]] for n, end in enumerate(ENDS[kind]))
@@ -306,7 +316,19 @@ def measurements(of: Records, kind: str, index: dict[str, Ints], content: Record
     values = np.linalg.eigvalsh(matrices) if len(of) else np.zeros((0, k))
     negative = values[:, 0] < -1e-9 * np.abs(values[:, -1])
     check_lines(content, [(of, negative, f"the {what} matrix is not positive semi-definite")])
+    if what == "covariance":
+        matrices, least = inverted(matrices)
+        check_lines(content, [(of, ~(least > 0.0), "the covariance matrix is singular")])
     return Measured(ends, of.numbers[:, :k], matrices)
+
+
+def inverted(matrices: Floats) -> tuple[Floats, Floats]:
+    """Return the inverses (e, k, k) of symmetric matrices, and their least eigenvalues (e,)."""
+    if len(matrices) == 0:
+        return matrices, np.zeros(0)
+    values, vectors = np.linalg.eigh(matrices)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (vectors / values[:, None, :]) @ np.swapaxes(vectors, 1, 2), values[:, 0]
 
 
 class Vertices(NamedTuple):

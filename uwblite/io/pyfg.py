@@ -88,20 +88,13 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> g
     )
     graph_file.check_lines(content, checks)
 
-    index = {"pose": pose_of, "landmark": landmark_of}
     lines = {"relative": steps, "observation": seen, "pose_prior": pinned, "landmark_prior": surveyed, "range": ranged}
     lines |= {"pose_range": meetings, "landmark_range": surveys}
-    plain = {}
-    for kind, of in lines.items():
-        measured = graph_file.measurements(of, kind, index, content, "covariance")
-        inverse, least = _inverted(measured.information)
-        graph_file.check_lines(content, [(of, ~(least > 0.0), "the covariance matrix is singular")])
-        plain[kind] = measured._replace(information=inverse)
     stamps = np.arange(len(pose_ids), dtype=np.float64)
     stamps[ends[:, 1]] = steps.stamps
     stamps[pose_of[vertices.names[:, 0]]] = vertices.stamps
     named = graph_file.Vertices(pose_ids, pose_of, vertices), graph_file.Vertices(landmark_ids, landmark_of, landmarks)
-    return graph_file.GraphFile.of(content, plain, named, stamps, from_odometry)
+    return graph_file.GraphFile.of(content, lines, named, stamps, "covariance", from_odometry)
 
 
 def write_pyfg(
@@ -158,17 +151,8 @@ def _lines(
         # A step is of the time of its end, a range of that of its first pose, what has none of that of the pose that is fixed.
         indices = [index for end, index in zip(graph_file.ENDS[kind], m.ends, strict=True) if end == "pose"]
         when = stamps[indices[-1 if kind == "relative" else 0]] if indices else np.full(len(m.value), stamps[first])
-        covariances = graph_file.upper_triangle(_inverted(m.information)[0])
+        covariances = graph_file.upper_triangle(graph_file.inverted(m.information)[0])
         yield graph_file.rows_of(tag, " %.6f" + " %s" * len(ends), [when, *ends], m.value, covariances)
-
-
-def _inverted(matrices: Floats) -> tuple[Floats, Floats]:
-    """Return the inverses (e, k, k) of symmetric matrices, and their least eigenvalues (e,)."""
-    if len(matrices) == 0:
-        return matrices, np.zeros(0)
-    values, vectors = np.linalg.eigh(matrices)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return (vectors / values[:, None, :]) @ np.swapaxes(vectors, 1, 2), values[:, 0]
 
 
 def _numbered(content: RecordFile) -> tuple[tuple[str, ...], Ints, tuple[str, ...], Ints]:

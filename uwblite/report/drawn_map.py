@@ -1,10 +1,10 @@
 """What is drawn of a map, as picture or as SVG: paths, anchors, closures, the box around them, and where names stand."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -119,16 +119,11 @@ def thin(n: int, most: int) -> Ints:
     return np.unique(np.append(np.arange(0, n, max(1, -(-n // most))), n - 1)) if n else np.zeros(0, dtype=np.intp)
 
 
-class _Judged(Protocol):
-    @property
-    def accepted(self) -> bool: ...
-
-
-def shown_closures(closures: Sequence[_Judged]) -> list[int]:
+def shown_closures(accepted: Iterable[bool]) -> list[int]:
     """Return the places of all accepted closures, then those of a sample of the rejected ones."""
-    accepted = np.array([c.accepted for c in closures], dtype=bool)
-    rejected = np.flatnonzero(~accepted)
-    return np.append(np.flatnonzero(accepted), rejected[thin(len(rejected), MOST_SHOWN)]).tolist()
+    kept = np.array([*accepted], dtype=bool)
+    rejected = np.flatnonzero(~kept)
+    return np.append(np.flatnonzero(kept), rejected[thin(len(rejected), MOST_SHOWN)]).tolist()
 
 
 def ellipse(covariance: Floats | None) -> tuple[float, float, float] | None:

@@ -218,7 +218,7 @@ def _closure_table(result: MapResult) -> str:
     text = f"<p>{count} of {len(result.closures)} candidates accepted.</p>" if result.closures else ""
     if outcomes:
         text += _table(("rejected because", "candidates"), [(why, str(n)) for why, n in outcomes.most_common()], "")
-    shown = [result.closures[k] for k in shown_closures(result.closures)]
+    shown = [result.closures[k] for k in shown_closures(c.accepted for c in result.closures)]
     rows = [
         (
             f"{c.i}\u2013{c.j}",

@@ -73,7 +73,7 @@ def _points(points: Floats) -> str:
 
 
 def _closures(drawn: DrawnMap) -> list[str]:
-    shown = [(k, drawn.closures[k]) for k in shown_closures(drawn.closures)]
+    shown = [(k, drawn.closures[k]) for k in shown_closures(c.accepted for c in drawn.closures)]
     groups = []
     for name, accepted in (("kept", True), ("rejected hidden", False)):
         lines = [

@@ -49,7 +49,8 @@ def advice(
     """
     found = _about_sensors(sensors, recorded, at_rest)
     if result is not None:
-        found += _about_anchors(result) + _about_loops(result) + _about_doubts(result)
+        found += _about_anchors(result) + _about_loops(result)
+        found += [f"the map is doubted: {text_of(doubt)}" for doubt in result.report.get("doubts") or ()]
     gone = sorted(name for name, silent in anchors.items() if silent > _ANCHOR_LOST)
     if gone and at_rest < _AT_REST and "radio" in sensors and sensors["radio"].silent < _SILENT:
         found.append(f"no range for more than a minute: {_listed(gone)}; out of reach, or without power")
@@ -98,10 +99,6 @@ def _about_loops(result: StoredResult) -> list[str]:
     if since > 2.0 * _OPEN_LOOP:
         return [f"no loop was closed on the last {since:.0f} m: come back to a place seen before"]
     return []
-
-
-def _about_doubts(result: StoredResult) -> list[str]:
-    return [f"the map is doubted: {text_of(d)}" for d in result.report.get("doubts") or ()]
 
 
 def text_of(notice: object) -> str:

@@ -75,7 +75,7 @@ def described(shown: ShownResult, edits: Constraints) -> dict[str, Any]:
     """Return everything that the page of `uwblite view` shows of a result."""
     result, report = shown.result, shown.result.report
     pinned = {a.id: list(a.position) for a in edits.anchors}
-    closures = [(k, result.closures[k]) for k in shown_closures(result.closures)]
+    closures = [(k, result.closures[k]) for k in shown_closures(c.accepted for c in result.closures)]
     return shown_head(result) | {
         "name": os.path.basename(os.path.abspath(result.folder)),
         "recordings": [os.path.basename(str(i.get("source", ""))) for i in report.get("inputs") or ()],
