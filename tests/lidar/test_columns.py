@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwblite import se2
-from uwblite.lidar.columns import fitted_circles, fitted_columns, join_circles, nearest_rims, surroundings
+from uwblite.lidar.columns import fitted_circles, fitted_columns, join_circles, nearest_rims, rim_distances
 from uwblite.lidar.surface_rays import as_rays
 from uwblite.odometry.attached import ScanPoints
 
@@ -67,21 +67,19 @@ def test_rays_that_do_not_bend_are_no_circle():
 
 
 @pytest.mark.parametrize("size", [10.0, 3000.0])
-def test_points_near_columns_are_found_by_the_squares_they_lie_in(size):
-    """All that are near, and of each the column of nearest rim, as if every point were compared with every column."""
+def test_points_near_columns_have_the_distance_to_the_nearest_rim(size):
+    """All that are near, as if every point were compared with every column."""
     rng = np.random.default_rng(2)
     columns = np.column_stack([rng.uniform(0.0, size, (7, 2)), rng.uniform(0.1, 0.8, 7)])
     anywhere, close = rng.uniform(-5.0, size + 5.0, (4000, 2)), rng.standard_normal((999, 2))
     at = np.concatenate([anywhere, columns[rng.integers(7, size=999), :2] + close])
-    rows, which, away = surroundings(columns, 0.3).nearest(at)
-    apart = np.hypot(*(at[:, None] - columns[None, :, :2]).transpose(2, 0, 1))
-    rim = apart - columns[:, 2]
-    np.testing.assert_array_equal(which, rim.argmin(axis=1)[rows])
-    np.testing.assert_allclose(away, rim.min(axis=1)[rows], rtol=1e-9, atol=1e-9)
-    near = np.flatnonzero((apart < columns[:, 2] + 0.3).any(axis=1))
-    assert len(near) > 100
-    assert np.isin(near, rows).all()
-    assert len(surroundings(columns[:0], 0.3).nearest(at)[0]) == 0
+    rim = (np.hypot(*(at[:, None] - columns[None, :, :2]).transpose(2, 0, 1)) - columns[:, 2]).min(axis=1)
+    near = rim < 0.3
+    assert near.sum() > 100
+    away = rim_distances(columns, at, 0.3)
+    np.testing.assert_allclose(away[near], rim[near], rtol=1e-9, atol=1e-9)
+    assert np.all(np.isinf(away[~near]))
+    assert np.all(np.isinf(rim_distances(columns[:0], at, 0.3)))
 
 
 def test_a_point_on_a_wide_column_is_not_that_of_a_narrow_one_whose_centre_is_nearer():
@@ -90,4 +88,4 @@ def test_a_point_on_a_wide_column_is_not_that_of_a_narrow_one_whose_centre_is_ne
     which, away = nearest_rims(columns, at)
     np.testing.assert_array_equal(which, [0, 1, 0, 0])
     np.testing.assert_allclose(away, [-0.01, -0.01, np.hypot(0.75, 0.25) - 0.8, -0.7])
-    np.testing.assert_array_equal(surroundings(columns, 0.3).on_rim(at, 0.02), [True, True, True, False])
+    np.testing.assert_allclose(rim_distances(columns, at, 0.02), away)

@@ -9,8 +9,8 @@ from helpers.wall_rays import seen
 
 from uwblite import se2
 from uwblite.lidar.clouds import Clouds
-from uwblite.lidar.columns import around_columns, on_columns, surroundings
-from uwblite.lidar.surface_rays import UNLEARNT, MeasuredSurfaces, ShapePolicy, SurfaceRays, as_rays, surfaces_of
+from uwblite.lidar.columns import around_columns, on_columns, rim_distances
+from uwblite.lidar.surface_rays import UNLEARNT, MeasuredSurfaces, SurfaceRays, as_rays, surfaces_of
 from uwblite.lidar.walls import find_walls, points_on, straight_pieces
 from uwblite.odometry.attached import ScanPoints
 
@@ -27,9 +27,7 @@ def test_points_of_clouds_are_told_walls_columns_and_the_rest():
     straight = find_walls(
         pieces,
         poses,
-        ~surroundings(np.array([[0.0, 1.2, 0.3]]), ShapePolicy.around).on_rim(
-            se2.transform_each(poses, pieces.keyframe, pieces.centre), 0.06
-        ),
+        np.isinf(rim_distances(np.array([[0.0, 1.2, 0.3]]), se2.transform_each(poses, pieces.keyframe, pieces.centre), 0.06)),
     )
     surfaces = surfaces_of(straight.centre, straight.normal, np.array([[0.0, 1.2, 0.3]]))
     kind = points_on(clouds, MeasuredSurfaces(surfaces, on.renumbered(straight.of_piece), UNLEARNT), poses)
@@ -58,7 +56,7 @@ def test_only_rays_that_face_a_column_count():
     scan = ScanPoints(rays.keyframe, rays.points, np.zeros((40, 2)), np.arange(40), np.zeros(40, dtype=np.intp))
     columns = np.array([[-1.5, 1.0, 0.4]])
     every = as_rays(scan)
-    near = around_columns(every, POSES, surroundings(columns, ShapePolicy.around))
+    near = around_columns(every, POSES, columns)
     assert np.all(np.isin(near.points, rays.points[rays.surface == 1]))
     found = on_columns(near, POSES, columns, 7)
     assert 0 < len(found.keyframe) <= 20

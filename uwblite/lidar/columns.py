@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Table, connected, dots
+from ..arrays import Floats, Ints, Table, connected, dots
 from ..odometry.attached import ScanPoints
 from .surface_rays import ShapePolicy, SurfaceRays, begins_run, range_sigma, to_circle
 
@@ -38,8 +38,6 @@ class ColumnPolicy:
     """Standard deviations within which at least half of the rays of a column must end: 0.67 if it is a perfect circle."""
 
 
-_MOST_SQUARES = 1 << 20
-"""Squares of the map that are near a column or not; a larger map gets larger ones."""
 _SINGULAR = 1e-14
 """Determinant, m^4, of places on a line."""
 
@@ -136,58 +134,22 @@ def nearest_rims(columns: Floats, at: Floats) -> tuple[Ints, Floats]:
     return which, away
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Surroundings:
-    """Columns and the squares of the map near them: few points of a map lie there, and only these are tested."""
-
-    columns: Floats
-    """(c, 3) x, y, radius."""
-    corner: Floats
-    """(2,) m, of the first square."""
-    size: float
-    """m, of a square."""
-    near: Bools
-    """(x, y) whether a square is near a column; the outermost ones are not."""
-
-    def nearest(self, at: Floats) -> tuple[Ints, Ints, Floats]:
-        """Return the rows (n,) of points (p, 2) in squares near a column, the column of nearest rim, and its distance, m.
-
-        It is negative within a column.
-        """
-        x, y = (
-            np.clip((at[:, k] - self.corner[k]) * (1.0 / self.size), 0.0, self.near.shape[k] - 1.0).astype(np.intp)
-            for k in range(2)
-        )
-        rows = np.flatnonzero(self.near.take(x * self.near.shape[1] + y))
-        if not len(rows):
-            return rows, rows, np.zeros(0)
-        return rows, *nearest_rims(self.columns, at.take(rows, axis=0))
-
-    def on_rim(self, at: Floats, margin: float) -> Bools:
-        """Return which points (p, 2) are nearer to a column's rim than a margin, m."""
-        rows, _, away = self.nearest(at)
-        found = np.zeros(len(at), dtype=bool)
-        found[rows] = np.abs(away) < margin
-        return found
+def rim_distances(columns: Floats, at: Floats, margin: float) -> Floats:
+    """Return the distances (p,) of points (p, 2) to the nearest rim of columns (c, 3), m, negative within one; inf beyond a
+    margin, m."""
+    found = np.full(len(at), np.inf)
+    if len(columns):
+        # Few points of a map lie near a column.
+        reach = float(columns[:, 2].max()) + margin
+        rows = np.flatnonzero(np.isfinite(cKDTree(columns[:, :2]).query(at, distance_upper_bound=reach)[0]))
+        found[rows] = nearest_rims(columns, at.take(rows, axis=0))[1]
+    return np.where(found < margin, found, np.inf)
 
 
-def surroundings(columns: Floats, margin: float) -> Surroundings:
-    """Return the squares within a margin, m, of columns (c, 3)."""
-    size = ShapePolicy.around
-    if not len(columns):
-        return Surroundings(columns, np.zeros(2), size, np.zeros((1, 1), dtype=bool))
-    reach, wide = columns[:, 2].max() + margin, np.ptp(columns[:, :2], axis=0)
-    size = max(size, float(np.sqrt(np.prod(wide + 2.0 * reach) / _MOST_SQUARES)))
-    corner = columns[:, :2].min(axis=0) - reach - 2.0 * size
-    x, y = np.ceil((wide + 2.0 * reach) / size + 2.0 * 2.0).astype(np.intp)
-    middle = corner + (np.stack(np.meshgrid(np.arange(x), np.arange(y), indexing="ij"), axis=-1) + 0.5) * size
-    return Surroundings(columns, corner, size, cKDTree(columns[:, :2]).query(middle)[0] < reach + size)
-
-
-def around_columns(rays: SurfaceRays, poses: Floats, columns: Surroundings) -> SurfaceRays:
-    """Return the rays from poses (k, 3) that end near columns."""
-    rows, _, away = columns.nearest(se2.transform_each(poses, rays.keyframe, rays.points))
-    return rays.rows(rows[away < ShapePolicy.around])
+def around_columns(rays: SurfaceRays, poses: Floats, columns: Floats) -> SurfaceRays:
+    """Return the rays from poses (k, 3) that end near columns (c, 3)."""
+    at = se2.transform_each(poses, rays.keyframe, rays.points)
+    return rays.rows(np.isfinite(rim_distances(columns, at, ShapePolicy.around)))
 
 
 def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) -> SurfaceRays:

@@ -16,7 +16,7 @@ from .. import se2
 from ..arrays import TINY, Bools, Floats, Ints, Table, bends, chunks, connected, dots, numbered, spread, unique_rows
 from ..odometry.attached import ScanPoints
 from .clouds import Clouds
-from .columns import surroundings
+from .columns import rim_distances
 from .surface_rays import MeasuredSurfaces, ShapePolicy, SurfaceRays, as_rays, begins_run
 
 
@@ -340,12 +340,11 @@ def points_on(clouds: Clouds, found: MeasuredSurfaces, sensors: Floats) -> NDArr
     it, 1 on a column, -1 on neither."""
     surfaces, kind = found.surfaces, np.full(len(clouds.points), -1, dtype=np.int8)
     shown, on = _shown_walls(found, sensors), ShapePolicy.on
-    columns = surfaces.rows(surfaces.round)
-    near = surroundings(np.column_stack([columns.place, columns.radius]), on)
+    columns = np.column_stack([surfaces.place, surfaces.radius])[surfaces.round]
     for part in chunks(len(kind)):
         at = se2.transform_each(sensors, clouds.owner[part], clouds.points[part].astype(np.float64))
         kind[part][np.isfinite(shown.query(at, distance_upper_bound=on)[0])] = 0
-        kind[part][near.on_rim(at, on)] = 1
+        kind[part][np.abs(rim_distances(columns, at, on)) < on] = 1
     return kind
 
 

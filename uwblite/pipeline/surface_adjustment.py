@@ -35,7 +35,7 @@ from ..lidar.columns import (
     fitted_columns,
     join_circles,
     on_columns,
-    surroundings,
+    rim_distances,
 )
 from ..lidar.joint_refinement import measured_again, with_fewer_pairs
 from ..lidar.ray_equations import RaySums, noise_of, weighted_sums
@@ -84,9 +84,10 @@ def find_surfaces(poses: Floats, scans: ScanClouds, task: Task) -> MeasuredSurfa
     """Return the surfaces of the map with clouds at poses (k, 3)."""
     circles, pieces, on = _shapes(scans, task, len(poses))
     columns = join_circles(circles, poses)
-    around, near = _around(columns, poses, on.rows(slice(0)), scans, task), surroundings(columns, ShapePolicy.on)
+    around = _around(columns, poses, on.rows(slice(0)), scans, task)
     middles = se2.transform_each(poses, pieces.keyframe, pieces.centre)
-    walls = find_walls(pieces, poses, ~near.on_rim(middles, ShapePolicy.on))
+    on_rim = np.abs(rim_distances(columns, middles, ShapePolicy.on)) < ShapePolicy.on
+    walls = find_walls(pieces, poses, ~on_rim)
     columns, on = fitted_columns(around, poses, columns), on.renumbered(walls.of_piece)
     surfaces = surfaces_of(walls.centre, walls.normal, columns)
     rays = concatenated([on, on_columns(around, poses, columns, len(walls.centre)).packed()])
@@ -112,8 +113,7 @@ def _around(columns: Floats, poses: Floats, none: SurfaceRays, scans: ScanClouds
     reach = max(r.log.scans.range_max for r in task.recordings.each if r.log.scans is not None)
     reach = min(task.config.clouds.range_max, reach)
     within = cKDTree(columns[:, :2]).query(poses[:, :2])[0] < reach + SurfacePolicy.ahead
-    near = surroundings(columns, ShapePolicy.around)
-    return concatenated([none, *(around_columns(as_rays(r), poses, near).packed() for r in _rays(scans, task, within))])
+    return concatenated([none, *(around_columns(as_rays(r), poses, columns).packed() for r in _rays(scans, task, within))])
 
 
 def _rays(scans: ScanClouds, task: Task, wanted: Bools) -> Iterator[ScanPoints]:
