@@ -6,7 +6,7 @@ import numpy as np
 from helpers.planted_graphs import random_poses, relative_edges
 
 from uwblite.graph.robust import Kernel
-from uwblite.loop_closure.closures import Closures, merged, no_closures, parted
+from uwblite.loop_closure.closures import Closures, merged, no_closures
 from uwblite.map_result import LoopClosure
 
 
@@ -51,12 +51,3 @@ def test_what_is_rejected_later_keeps_its_record_and_says_why():
     assert [(c.outcome, c.reason) for c in left.candidates] == [
         ("accepted", ""), ("not-found", ""), ("inconsistent", "b"), ("accepted", ""),
     ]  # fmt: skip
-
-
-def test_a_collection_in_parts_holds_each_edge_with_its_record():
-    one = some(["accepted", "not-found", "accepted", "accepted"])
-    first, later = parted(one, np.array([False, True, False]))
-    assert (first.edges.i.tolist(), later.edges.i.tolist()) == ([2], [0, 3])
-    assert [c.i for c in first.candidates] == [1, 2]
-    assert [c.i for c in later.candidates] == [0, 3]
-    same(parted(one, np.ones(3, dtype=bool))[0], one)

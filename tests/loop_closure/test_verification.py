@@ -13,13 +13,14 @@ from scipy.spatial import cKDTree
 from uwblite import se2
 from uwblite.graph.marginals import JointCovariance
 from uwblite.graph.pose_edges import RelativePoseEdges
+from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import SolverConfig, optimize
 from uwblite.lidar.correlative_matching import CorrelativeConfig
 from uwblite.lidar.submaps import SubmapConfig, build
 from uwblite.loop_closure.candidates import Candidates, propose
 from uwblite.loop_closure.closures import Closures, LoopClosureConfig, merged, no_closures
 from uwblite.loop_closure.matching import ClosureMatches
-from uwblite.loop_closure.verification import _judge, confirmed, find, reconcile
+from uwblite.loop_closure.verification import _judge, find, reconcile, without_look_alikes
 from uwblite.map_result import LoopClosure
 
 PERIOD = 1.2
@@ -272,12 +273,14 @@ def planted_closures(rng, truth, count, false_share) -> tuple[Closures, np.ndarr
     false = rng.random(count) < false_share
     pose[false] += rng.uniform(0.5, 2.0, (false.sum(), 3)) * [1.0, 1.0, 0.2]
     root = np.tile(np.diag([100.0, 100.0, 250.0]), (count, 1, 1))
-    information = root @ root
-    records = tuple(
-        LoopClosure(int(a), int(b), z, h, 0.01, 0.9, "accepted", "planted")
-        for a, b, z, h in zip(i, j, pose, information, strict=True)
-    )
-    return Closures(RelativePoseEdges(i, j, pose, root), records), false
+    return recorded(RelativePoseEdges(i, j, pose, root)), false
+
+
+def recorded(edges: RelativePoseEdges) -> Closures:
+    """Return closures with the record of each."""
+    information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information
+    columns = zip(edges.i.tolist(), edges.j.tolist(), edges.T_i_j, information, strict=True)
+    return Closures(edges, tuple(LoopClosure(*each, 0.01, 0.9, "accepted", "planted") for each in columns))
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -354,17 +357,27 @@ def test_a_robot_that_never_returns_has_no_candidates():
     assert optimize(graph, SOLVER)[1].converged
 
 
-def test_closures_that_agree_along_the_way_confirm_each_other_and_copies_do_not():
-    """Two laps of 250 m; one closure takes a place for its copy, 8 m and a quarter of a turn away, and one stands alone."""
-    lap = 250
+def test_places_that_look_alike_leave_and_those_that_are_right_stay():
+    """Two laps of 250 m; at one place two closures of a copy, 8 m and a quarter of a turn away, agree with each other."""
+    lap, first = 250, np.array([10, 50, 90, 130, 170, 180, 220])
     truth = chain(np.zeros(3), np.tile([1.0, 0.0, 2.0 * np.pi / lap], (2 * lap, 1)))
-    first = np.array([10, 50, 90, 130])
+    path, copy = np.arange(2.0 * lap), np.isin(first, [170, 180])
     for seed in range(5):
         rng = np.random.default_rng(seed)
         graph = drifted(rng, truth, NOISE)
-        covariance = JointCovariance(graph, np.append(first, first + lap))
+        graph = replace(graph, edges=(replace(graph.edges[0], kernel=Kernel("cauchy", 5.0)),))
         edges = relative_edges(truth, first, first + lap, [0.05, 0.05, 0.01], rng)
-        assert confirmed(edges, graph, covariance, np.arange(2.0 * lap)).all()
-        copy = replace(edges, T_i_j=edges.T_i_j + np.where(np.arange(4) == 2, 1.0, 0.0)[:, None] * [8.0, 0.0, np.pi / 2.0])
-        assert confirmed(copy, graph, covariance, np.arange(2.0 * lap)).tolist() == [True, True, False, True]
-        assert not confirmed(edges.rows(slice(1)), graph, covariance, np.arange(2.0 * lap)).any()
+        away = edges.T_i_j + copy[:, None] * [8.0, 0.0, np.pi / 2.0]
+        for planted, right in ((edges, np.full(len(first), True)), (replace(edges, T_i_j=away), ~copy)):
+            solved, _ = optimize(graph.with_edges(planted), SOLVER)
+            start = replace(solved, edges=graph.edges)
+            _, left = without_look_alikes(start, recorded(planted), path, SOLVER)
+            assert [c.accepted for c in left.candidates] == right.tolist()
+
+
+def test_a_place_that_nothing_contradicts_stays():
+    graph = drifted(np.random.default_rng(0), chain(np.zeros(3), np.tile([1.0, 0.0, 0.1], (63, 1))), NOISE)
+    away = recorded(RelativePoseEdges(np.array([0]), np.array([62]), np.array([[0.0, 0.0, 1.0]]), 20.0 * np.eye(3)[None]))
+    slack = replace(graph, edges=tuple(replace(e, sqrt_information=0.01 * e.sqrt_information) for e in graph.edges))
+    assert without_look_alikes(slack, away, np.arange(64.0), SOLVER)[1].candidates[0].accepted
+    assert without_look_alikes(graph, no_closures(), np.arange(64.0), SOLVER)[0] is graph

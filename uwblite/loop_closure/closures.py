@@ -100,16 +100,6 @@ def no_closures() -> Closures:
     return collected((), np.zeros((0, *se2.POSE, *se2.POSE)))
 
 
-def parted(closures: Closures, first: Bools) -> tuple[Closures, Closures]:
-    """Return the closures whose edges are first (e,), with the record of all candidates that have none, and the others."""
-    edges, mask = closures.edges, iter(first.tolist())
-    later = [closure.accepted and not next(mask) for closure in closures.candidates]
-    now, others = (
-        tuple(c for c, waits in zip(closures.candidates, later, strict=True) if waits == wanted) for wanted in (False, True)
-    )
-    return Closures(edges.rows(np.flatnonzero(first)), now), Closures(edges.rows(np.flatnonzero(~first)), others)
-
-
 def merged(one: Closures, other: Closures) -> Closures:
     """Return both collections as one, with the kernel of the other's edges where it has any."""
     last = other if len(other.edges) else one

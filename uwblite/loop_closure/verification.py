@@ -11,16 +11,17 @@ from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
+from scipy.special import chdtri
 
 from .. import se2
-from ..arrays import TINY, Bools, Floats
+from ..arrays import TINY, Floats, Ints
 from ..graph.gnc import optimize_tightening
-from ..graph.graph import Graph
-from ..graph.marginals import JointCovariance
+from ..graph.graph import Graph, edge_cost
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
-from ..graph.solver import SolverConfig
+from ..graph.solver import SolverConfig, optimize
 from ..lidar.correlative_matching import CorrelativeConfig
 from ..lidar.scan_matching import measured
 from ..lidar.submaps import Submaps
@@ -37,8 +38,6 @@ _TIGHTER = 3.0
 """Ratio of each scale of that kernel to the next, and the scale of that of what remains, standard deviations."""
 _SLID = 3
 """Most searches for shifted stretches: without the closures that moved one, another may show."""
-_ALONG = 4.0
-"""Lengths of a stretch within which closures confirm each other: along more, a chain is too uncertain to contradict them."""
 
 
 def find(
@@ -110,34 +109,48 @@ def _judge(
     return verdicts
 
 
-def confirmed(edges: RelativePoseEdges, graph: Graph, covariance: JointCovariance, path: Floats) -> Bools:
-    """Return which closures (e,) agree with another one, some way before or after them, along the chain between both.
+def without_look_alikes(graph: Graph, closures: Closures, path: Floats, solver: SolverConfig) -> tuple[Graph, Closures]:
+    """Drop closures of places that only look alike: without them all other measurements are far more probable.
 
-    A place and its copy elsewhere look alike here and there; closures that are right agree wherever two visits share their way
-    (E. Olson, Recognizing places using spectrally clustered local matches, 2009).
+    All closures between the same stretches of the path are one piece of evidence, however many: a copy of a place matches
+    everywhere. The group that costs the others most leaves first, since it makes those that are right cost as much.
 
     Parameters
     ----------
-    graph, covariance : of the chain without them. path : (k,) travelled distance, m.
+    graph : solved with the closures, without their edges. path : (k,) travelled distance, m.
+
+    Returns
+    -------
+    The graph, solved again where closures left, and those that remain; the others carry the reason.
     """
-    found = np.zeros(len(edges), dtype=bool)
-    a, b = np.triu_indices(len(edges), 1)
-    i, j, length = edges.i, edges.j, CandidatePolicy.length
-    apart = np.abs([path[k[a]] - path[k[b]] for k in (i, j)])
-    near = ((apart >= length) & (apart <= _ALONG * length)).all(axis=0)
-    a, b = a[near], b[near]
-    if not len(a):
-        return found
-    here, there = (se2.between(graph.poses[k[a]], graph.poses[k[b]]) for k in (i, j))
-    off = se2.between(se2.compose(edges.T_i_j[a], there), se2.compose(here, edges.T_i_j[b]))
-    before, after = (covariance.relative(k[a], k[b]) for k in (i, j))
-    turn = before[:, 2, 2] + after[:, 2, 2]
-    place = np.trace(before[:, :2, :2] + after[:, :2, :2], axis1=1, axis2=2)
-    place += before[:, 2, 2] * np.sum(edges.T_i_j[b, :2] ** 2, axis=1)
-    squared = np.sum(off[:, :2] ** 2, axis=1) / place + se2.wrap_angle(off[:, 2]) ** 2 / turn
-    agree = squared < LoopClosureConfig.agrees**2
-    found[a[agree]] = found[b[agree]] = True
-    return found
+    quick = replace(solver, relative_decrease=_ROUGH)
+    most = CandidatePolicy.wider**2 * chdtri(se2.POSE[0], CandidatePolicy.never)
+    while len(closures.edges):
+        group = _meetings(closures.edges, path)
+        costs, solved = [], []
+        for number in range(group.max() + 1):
+            rest = graph.with_edges(closures.edges.rows(np.flatnonzero(group != number)))
+            solved.append(optimize(rest, quick)[0])
+            costs.append(_cost(rest) - _cost(solved[-1]))
+        worst = int(np.argmax(costs))
+        if costs[worst] <= most:
+            break
+        reason = f"a place that looks alike: without it chi2 of all others falls by {costs[worst]:.0f} (most {most:.0f})"
+        closures = closures.without(group != worst, "contradicts-graph", [reason] * len(group))
+        graph = replace(solved[worst], edges=graph.edges)
+    return graph, closures
+
+
+def _meetings(edges: RelativePoseEdges, path: Floats) -> Ints:
+    """Return for each closure (e,) the number of the group that connects the same two stretches of the path (k,), m."""
+    ends = np.sort(path[np.stack([edges.i, edges.j])], axis=0)
+    near = (np.abs(ends[:, :, None] - ends[:, None]) < CandidatePolicy.length).all(axis=0)
+    return np.asarray(connected_components(near, directed=False)[1], dtype=np.intp)
+
+
+def _cost(graph: Graph) -> float:
+    """Return chi2 of all edges under their kernels."""
+    return sum(edge_cost(edges, edges.residuals(graph)) for edges in graph.edges)
 
 
 def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solver: SolverConfig) -> tuple[Graph, Closures]:

@@ -95,25 +95,21 @@ def _with_long_stretches_tied(base: Graph, estimate: Estimate, task: Task) -> tu
     covariance = JointCovariance(base, reference)
     pieces = submaps.of_pieces(estimate.lidar.clouds, base.poses, first, last, reference, task.config.submaps)
     pieces, free = _static(pieces, base, estimate)
-    tried, waiting, with_ranges = Tried(), closures.no_closures(), estimate.ranges is not None
+    tried, with_ranges = Tried(), estimate.ranges is not None
     for _ in range(RoundPolicy.wide_rounds):
         pairs = closure_candidates.first_of(
             closure_candidates.uncertain_pairs(
                 base, covariance, pieces, recordings.of_keyframe, tried, with_ranges, rules, rules.direct
             )
         )
-        if not len(pairs.target) and not len(waiting.edges):
+        if not len(pairs.target):
             break
         tried |= pairs.names(rules)
-        new = closures.merged(waiting, _verified(pairs, pieces, free, rules, task))
-        # What looks alike closes loops falsely, here and there; closures that are right confirm each other along the way.
-        sure = verification.confirmed(closures.merged(found, new).edges, base, covariance, recordings.path)[len(found.edges) :]
-        sure |= not sure.any()
-        new, waiting = closures.parted(new, sure)
+        new = _verified(pairs, pieces, free, rules, task)
         base, found = _reconciled(base, found, new, task)
         if len(new.edges):
+            base, found = verification.without_look_alikes(base, found, recordings.path, task.config.solver)
             covariance = JointCovariance(base.with_edges(found.edges), reference)
-    base, found = _reconciled(base, found, waiting, task)
     if not tried:
         return base, found
     task.stages.end("long stretches", stretches=len(pieces), candidates=len(tried), accepted=len(found.edges))
