@@ -9,7 +9,7 @@ from emulators.world import Epoch, WorldClock
 from helpers.driver_harness import check_transcript, feed_whole, good
 
 from uwblite.drivers.dwm1001_driver import Dwm1001Driver
-from uwblite.drivers.dwm1001_tlv import Answer, Distances, NodeConfig, Position, Status, TlvProtocol, UpdateRate, Value
+from uwblite.drivers.dwm1001_tlv import Answer, Distances, NodeConfig, Status, TlvProtocol, UpdateRate, Value
 from uwblite.drivers.events import RangeReading
 
 POSITION = "4b0a00001f0400009c0e000064"
@@ -42,7 +42,7 @@ def transcript():
         ok + bytes.fromhex("4e081215950448f0cade"),
         bytes.fromhex("400101"),
     ]
-    position = Position(1.0)
+    position = Value(1.0, "position quality", 100)
     expected = [
         Answer(1.0, 0), Status(1.0, 3),
         Answer(1.0, 0), position, Distances(1.0, RANGES),

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from ..drivers.devices import DEVICES, SENSORS, DeviceKind, Setup, kinds_on_usb
 from ..drivers.events import Action, Note, Reopen, Send, SetBaud, SetDtr
 from ..drivers.link import Link
-from ..drivers.session import Session
+from ..drivers.session import Driver, Session
 from ..drivers.transport import Port, check_url, open_port, plugged_in
 from ..errors import DeviceError
 from .console import note, say, say_json
@@ -84,10 +84,11 @@ def look(path: str, kinds: list[DeviceKind], pan_id: int | None) -> PortReport:
     seen = PortReport(path)
     tried = kinds or [kind for kind in DEVICES.values() if kind.probe]
     try:
-        with closing(open_port(path, tried[0].baud)) as port:
+        with closing(open_port(path, Driver.baud)) as port:
             for kind in sorted(tried, key=lambda kind: not kind.talks):
-                port.set_baud(kind.baud)
-                if _ask(port, kind, seen):
+                session = Session(kind.driver({}, Setup(stream=False)))
+                port.set_baud(session.baud)
+                if _ask(port, session, LISTEN if kind.talks else ASK, seen):
                     network = seen.details.get("network")
                     if pan_id is not None and network not in (None, "0x0000", f"0x{pan_id:04X}"):
                         text = f"the network id is {network}: in the shell type `nis 0x{pan_id:04X}`, then `reset`"
@@ -101,11 +102,9 @@ def look(path: str, kinds: list[DeviceKind], pan_id: int | None) -> PortReport:
     return seen
 
 
-def _ask(port: Port, kind: DeviceKind, seen: PortReport) -> bool:
-    """Let a device's session find it; True when it did."""
-    driver = kind.driver({}, Setup(stream=False))
-    session, notes = Session(driver), list[Note]()
-    link = Link(kind.sensor, seen.path, session)
+def _ask(port: Port, session: Session, patience: float, seen: PortReport) -> bool:
+    """Let a device's session find it, for so long, s; True when it did."""
+    driver, notes, link = session.driver, list[Note](), Link("", seen.path, session)
     link.port = port
 
     def do(actions: list[Action]) -> bool:
@@ -115,7 +114,7 @@ def _ask(port: Port, kind: DeviceKind, seen: PortReport) -> bool:
         notes.extend(action for action in actions if isinstance(action, Note))
         return not any(isinstance(action, Reopen) for action in actions)
 
-    end = time.monotonic() + (LISTEN if kind.talks else ASK)
+    end = time.monotonic() + patience
     going = do(session.start(time.monotonic()))
     while going and time.monotonic() < end and not driver.ready:
         data = port.read()

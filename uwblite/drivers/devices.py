@@ -96,8 +96,6 @@ class DeviceKind:
     """One of SENSORS."""
     title: str
     make: Callable[[Values, Setup], Driver]
-    baud: int = 115200
-    """bit/s that it is looked for with first."""
     usb: tuple[str, ...] = ()
     """"vvvv:pppp" in lower-case hexadecimal."""
     product: str = ""
@@ -282,13 +280,12 @@ _ROWS = (
         "lidar",
         "LDROBOT LD06, LD19, STL-19P",
         lambda *_: LdLidarDriver(),
-        LdLidarDriver.baud,
         CP2102,
         talks=True,
         silent="the lidar is silent: its motor must turn, and its PWM wire must lie on ground or hang free",
     ),
-    DeviceKind("ydlidar-x2", "lidar", "YDLIDAR X2", lambda *_: YdLidarX2Driver(), YdLidarX2Driver.baud, CP2102, talks=True),
-    DeviceKind("ydlidar-x4", "lidar", "YDLIDAR X4", lambda *_: YdLidarX4Driver(), YdLidarX4Driver.baud, CP2102),
+    DeviceKind("ydlidar-x2", "lidar", "YDLIDAR X2", lambda *_: YdLidarX2Driver(), CP2102, talks=True),
+    DeviceKind("ydlidar-x4", "lidar", "YDLIDAR X4", lambda *_: YdLidarX4Driver(), CP2102),
     DeviceKind(
         "rplidar",
         "lidar",
@@ -300,7 +297,7 @@ _ROWS = (
             "baud": _baud(RpLidarDriver.baud, "found by itself"),
         },
     ),
-    DeviceKind("lds01", "lidar", "Hitachi-LG LDS-01 (HLS-LFCD2)", lambda *_: Lds01Driver(), Lds01Driver.baud, CP2102),
+    DeviceKind("lds01", "lidar", "Hitachi-LG LDS-01 (HLS-LFCD2)", lambda *_: Lds01Driver(), CP2102),
 )
 DEVICES = {kind.name: kind for kind in _ROWS}
 """By name. The first kind of a sensor that has no name of its own in what the user wrote is DEFAULT's."""

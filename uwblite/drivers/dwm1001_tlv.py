@@ -43,13 +43,6 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
-class Position:
-    """The module's own estimate of a position, of which uwblite uses nothing."""
-
-    stamp: float
-
-
-@dataclass(frozen=True, slots=True)
 class Distances:
     """Distances of the latest fix."""
 
@@ -112,13 +105,13 @@ class Value:
 
     stamp: float
     name: str
-    """"firmware", "configuration", "hardware", "pan_id" or "node_id"."""
+    """"firmware", "configuration", "hardware", "pan_id" or "node_id"; of a position, which is not used, its quality."""
     value: int
 
 
 Fact = Status | UpdateRate | NodeConfig | Value
 """What a module answers of itself."""
-Event = Answer | Position | Distances | Fact | Corrupt
+Event = Answer | Distances | Fact | Corrupt
 
 _VALUES = {0x4D: (2, "pan_id"), 0x4E: (8, "node_id"), 0x50: (4, "firmware"), 0x51: (4, "configuration"), 0x52: (4, "hardware")}
 _LENGTHS = {0x41: 13, 0x45: 4, 0x46: 2, 0x5A: 2, **{kind: size for kind, (size, _) in _VALUES.items()}}
@@ -160,7 +153,7 @@ def decode(piece: bytes, stamp: float) -> Event:
         x, y, z, quality = _POSITION.unpack(value)
         if quality > 100 or max(abs(x), abs(y), abs(z)) > MAX_PLACE_MM:
             return Corrupt("position or quality out of range")
-        return Position(stamp)
+        return Value(stamp, "position quality", quality)
     if kind == 0x45:
         normal, stationary = struct.unpack("<HH", value)
         return UpdateRate(stamp, normal / 10, stationary / 10)

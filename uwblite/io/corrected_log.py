@@ -84,24 +84,34 @@ def _corrected(blocks: Iterator[bytes], kinds: tuple[bytes, ...], poses_at: Pose
     """Yield the lines of each block as they are to be written, and how many laser messages of some kinds are left out."""
     ipc_left_out = False
     for block in blocks:
-        kept: list[bytes | tuple[list[bytes], int]] = []
-        stamps, broken = [], 0
-        for line in block.splitlines(keepends=True):
+        kept: list[tuple[list[bytes], int]] = []  # words of a scan, and where its poses stand; or a line as it is, and 0
+        stamps, left_out = [], 0
+        for line in block.splitlines():
             if line.startswith(_KEPT):
-                kept.append(line)
+                kept.append(([line], 0))
             elif line.startswith(b"ODOM "):
                 ipc_left_out = len(line.split()) == _ODOM_WITHOUT_IPC
             elif line.startswith(kinds):
                 try:
                     words = line.split()
                     place, stamp = _poses_in(words, ipc_left_out)
-                    if kinds == _RAW:
-                        words = [b"ROBOTLASER1", *words[1:place], *_UNPOSED, *words[place:]]
-                    kept.append((words, place))
-                    stamps.append(stamp)
                 except (ValueError, IndexError):
-                    broken += 1
-        yield _correct_poses(kept, np.array(stamps), broken, poses_at)
+                    left_out += 1
+                    continue
+                if kinds == _RAW:
+                    words = [b"ROBOTLASER1", *words[1:place], *_UNPOSED, *words[place:]]
+                kept.append((words, place))
+                stamps.append(stamp)
+        poses, lines = iter(np.concatenate(poses_at(np.array(stamps)), axis=1).tolist()), []
+        for words, place in kept:
+            if place:
+                corrected = next(poses)[: 3 if words[0] == b"FLASER" else 6]
+                words[place : place + len(corrected)] = [b"%.6f" % value for value in corrected]
+                if not np.isfinite(corrected).all():
+                    left_out += 1
+                    continue
+            lines.append(b" ".join(words) + b"\n")
+        yield lines, left_out
 
 
 def _poses_in(words: list[bytes], ipc_left_out: bool) -> tuple[int, float]:
@@ -110,27 +120,6 @@ def _poses_in(words: list[bytes], ipc_left_out: bool) -> tuple[int, float]:
     behind = HEAD[name] + int(words[HEAD[name] - 1])
     place, stamp = split_tail(name, words[behind:], ipc_left_out)
     return behind + place, stamp
-
-
-def _correct_poses(
-    kept: list[bytes | tuple[list[bytes], int]], stamps: Floats, broken: int, poses_at: PosesAt
-) -> tuple[list[bytes], int]:
-    """Return lines in which the words at the poses are corrected, and the number of scans left out."""
-    laser, robot = poses_at(stamps)
-    lines, scan = [], 0
-    for entry in kept:
-        if isinstance(entry, bytes):
-            lines.append(entry)
-            continue
-        words, place = entry
-        corrected = laser[scan] if words[0] == b"FLASER" else np.concatenate([laser[scan], robot[scan]])
-        scan += 1
-        if np.isfinite(corrected).all():
-            words[place : place + len(corrected)] = [b"%.6f" % value for value in corrected.tolist()]
-            lines.append(b" ".join(words) + b"\n")
-        else:
-            broken += 1
-    return lines, broken
 
 
 _SAME_TIME = 0.5
