@@ -5,7 +5,6 @@ whose cheapest path is the new line. It is cut into short pieces and shortened a
 compared by its cost and not by its length, so that the line stays as far from obstacles as the search wanted.
 """
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from .. import se2
 from ..arrays import TINY, WIDE, Bools, Floats, Ints, numbered
-from .clearance import AT_ONCE, COMFORT, ClearanceMap
+from .clearance import AT_ONCE, ClearanceMap
 
 _SAMPLES_PER_CELL = 2
 """Where clearance and cost of a line are looked up."""
@@ -47,50 +46,18 @@ class Lines(NamedTuple):
 def along_lines(clearance: ClearanceMap, begin: Floats, end: Floats) -> Lines:
     """Look up clearance and cost along straight lines between places (n, 2) and (n, 2), m, map frame."""
     lengths = np.hypot(*(end - begin).T)
-    roomy = _roomy(clearance, begin, end, lengths)
-    found = Lines(lengths.copy(), roomy.copy(), roomy, np.zeros(len(lengths), dtype=np.bool_))
-    for which, count in _parts(~roomy, lengths, clearance.geometry.resolution / _SAMPLES_PER_CELL):
-        part = _along(clearance, begin[which], end[which], lengths[which], count)
-        for whole, values in zip(found, part, strict=True):
-            whole[which] = values
-    return found
-
-
-def _roomy(clearance: ClearanceMap, begin: Floats, end: Floats, lengths: Floats) -> Bools:
-    """Return which lines (n,) are so far from everything that a few of their places show that they are open."""
-    shown = np.zeros(len(lengths), dtype=np.bool_)
-    free, cell = clearance.radius + COMFORT, clearance.geometry.resolution
-    # As far apart as clearances that are cut off a cell beyond `free` allow (see clearance.py), and a quarter of it.
-    apart = np.sqrt(2.0 * cell * (4.0 * free + cell)) * np.array([1.0, 0.25])
-    for step in apart if clearance.refused else ():
-        for which, count in _parts(~shown & (lengths > step), lengths, step):
-            points, _, first = _samples(begin[which], end[which], count)
-            away = np.minimum.reduceat(clearance.bounds(points), first)
-            shown[which] = away >= free**2 + (0.5 * lengths[which] / count) ** 2
-    return shown
-
-
-def _parts(lines: Bools, lengths: Floats, step: float) -> Iterator[tuple[Ints, Ints]]:
-    """Yield some of the lines (n,) in parts (k,) of bounded work, and how many pieces (k,) each has of at most a step, m."""
-    which = np.flatnonzero(lines)
-    pieces = np.ceil(lengths[which] / step).astype(np.intp) + 1
-    ends = np.flatnonzero(np.diff(np.cumsum(pieces + 1) // AT_ONCE)) + 1
-    if len(which):
-        yield from zip(np.split(which, ends), np.split(pieces, ends), strict=True)
-
-
-def _samples(begin: Floats, end: Floats, pieces: Ints) -> tuple[Floats, Ints, Ints]:
-    """Return the ends (k, 2) of so many equal pieces (n,) of lines, the line of each (k,), and the first of each line (n,)."""
-    owner, number = numbered(pieces + 1)
-    share = (number / pieces[owner])[:, None]
-    return begin[owner] + share * (end - begin)[owner], owner, np.flatnonzero(number == 0)
+    pieces = np.ceil(lengths * _SAMPLES_PER_CELL / clearance.geometry.resolution).astype(np.intp) + 1
+    parts = np.split(np.arange(len(lengths)), np.flatnonzero(np.diff(np.cumsum(pieces + 1) // AT_ONCE)) + 1)
+    found = [_along(clearance, begin[part], end[part], lengths[part], pieces[part]) for part in parts]
+    return Lines(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
 def _along(clearance: ClearanceMap, begin: Floats, end: Floats, lengths: Floats, pieces: Ints) -> Lines:
     """Look up lines (n,) at the ends of so many equal pieces (n,) of each."""
-    points, owner, first = _samples(begin, end, pieces)
+    owner, number = numbered(pieces + 1)
+    points = begin[owner] + (number / pieces[owner])[:, None] * (end - begin)[owner]
     squared, cost = clearance.at(points)
-    step = lengths / pieces
+    step, first = lengths / pieces, np.flatnonzero(number == 0)
     clear = clearance.keeps(points, squared, (clearance.radius**2 + (0.5 * step) ** 2)[owner], owner)
     last = first + pieces
     costs = step * (np.add.reduceat(cost, first) - 0.5 * (cost[first] + cost[last]))
