@@ -99,21 +99,11 @@ def _unfiltered(rows: Image, channels: int, path: str) -> Image:
     unknown = np.flatnonzero(kinds > 4)
     if len(unknown):
         raise FormatError(f"the PNG's row {unknown[0]} names an unknown filter", path)
-    image = np.empty((height, width, channels), dtype=np.uint8)
-    above = np.zeros((width, channels), dtype=np.uint8)
-    for start in range(0, height, _BAND):
-        band = slice(start, start + _BAND)
-        image[band] = _by_diagonals(kinds[band], lines[band], above) if kinds[band].any() else lines[band]
-        above = image[band][-1]
-    return image
+    return _by_diagonals(kinds, lines) if kinds.any() else lines
 
 
-_BAND = 1024
-"""Rows decoded together, so that they stay in the processor's cache."""
-
-
-def _by_diagonals(kinds: Image, lines: Image, above: Image) -> Image:
-    """Undo the filters of a band of rows.
+def _by_diagonals(kinds: Image, lines: Image) -> Image:
+    """Undo the filters of rows.
 
     A pixel needs its left, upper and upper left neighbours, so that all pixels of an anti-diagonal, row + column = d, can
     be decoded at once. In a flat array of rows of P pixels these lie P - 1 apart.
@@ -121,7 +111,7 @@ def _by_diagonals(kinds: Image, lines: Image, above: Image) -> Image:
     height, width, channels = lines.shape
     pitch = width + 1
     padded = np.zeros((height + 1, pitch, channels), dtype=np.uint8)
-    padded[0, 1:], padded[1:, 1:] = above, lines
+    padded[1:, 1:] = lines
     flat = padded.reshape(-1, channels)
     for d in range(2, height + width + 1):
         first, last = max(1, d - width), min(height, d - 1)
