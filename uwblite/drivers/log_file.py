@@ -16,7 +16,6 @@ from ..errors import DataError
 from .events import GyroHeading, LaserScan, Measurement, OdometryPose, RangeEpoch
 from .link import Host, Link, Mounting
 
-_MILLIMETRES = tuple(f"{mm / 1000:.3f}" for mm in range(8192))
 COUNT = 1e-6
 """s, resolution of the stamps in the log."""
 TAIL, _PIECE = 1 << 18, 1 << 20
@@ -28,8 +27,7 @@ def metre_text(value: float, limit: float) -> str:
     """Write a range: nothing seen (+inf) as the maximum range, invalid (nan) as 0.000."""
     if math.isnan(value):
         return "0.000"
-    millimetres = round(min(value, limit) * 1000)
-    return _MILLIMETRES[millimetres] if 0 <= millimetres < 8192 else f"{millimetres / 1000:.3f}"
+    return f"{round(min(value, limit) * 1000) / 1000:.3f}"
 
 
 def number_text(value: float) -> str:

@@ -105,17 +105,11 @@ def clean(ranges: NDArray[np.float32], range_min: float, range_max: float, *, ze
     ----------
     zero_is_nothing : a 0 is no echo, as drivers of ROS older than REP-117 write it.
     """
-    for start in range(0, len(ranges), _AT_ONCE):
-        part = ranges[start : start + _AT_ONCE]
-        with np.errstate(invalid="ignore"):
-            nothing = part >= np.float32(range_max)
-            nothing = nothing | (part == 0.0) if zero_is_nothing else nothing
-            part[~(part >= np.float32(range_min))] = np.nan
-        part[nothing] = np.inf
-
-
-_AT_ONCE = 256
-"""Scans cleaned at a time, for the memory that it takes."""
+    with np.errstate(invalid="ignore"):
+        nothing = ranges >= np.float32(range_max)
+        nothing |= zero_is_nothing & (ranges == 0.0)
+        ranges[~(ranges >= np.float32(range_min))] = np.nan
+    ranges[nothing] = np.inf
 
 
 def reach_of(ranges: NDArray[np.float32], warnings: list[str]) -> float:
