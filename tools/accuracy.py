@@ -49,7 +49,7 @@ from trials import (
 
 from uwblite import se2
 from uwblite.config import override
-from uwblite.evaluation.relations import Relations, evaluate_relations
+from uwblite.evaluation.relations import evaluate_relations
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.graph.gnc import optimize_gnc
 from uwblite.graph.graph import Edges, Graph
@@ -389,7 +389,7 @@ def benchmark(args: argparse.Namespace) -> str:
         folder, (bar, turn, *others) = SHARED / "kummerle" / name, BENCHMARK[name]
         if not folder.is_dir():
             continue
-        log, relations = read_log(folder / "run.log.gz"), Relations(*read_relations(folder / "truth.relations.gz"))
+        log, relations = read_log(folder / "run.log.gz"), read_relations(folder / "truth.relations.gz")
         runs, turns, kept = [], [], []
         for seed in range(args.perturb + 1):
             result = build_map(perturbed(log, seed), config)

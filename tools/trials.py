@@ -23,7 +23,7 @@ from simulation.recording import Recording, Settings, simulate
 from uwblite import se2
 from uwblite.cli.evaluate import read_landmarks
 from uwblite.evaluation.map import LandmarkErrors, Landmarks, find_columns, landmark_errors, landmark_errors_along
-from uwblite.evaluation.relations import Relations, evaluate_relations
+from uwblite.evaluation.relations import evaluate_relations
 from uwblite.evaluation.trajectory import evaluate_anchors, evaluate_trajectory
 from uwblite.io.carmen import read_log
 from uwblite.io.csv_table import read_csv
@@ -172,7 +172,7 @@ def real_error(folder: Path, log: SensorLog, result: MapResult, truth: tuple[Flo
     """
     if truth is None and (folder / "truth.relations.gz").exists():
         relations, delay = read_relations(folder / "truth.relations.gz"), result.graph.calibration.get("laser_delay")
-        return evaluate_relations(result.stamps, result.trajectory, Relations(*relations), delay).translations.mean
+        return evaluate_relations(result.stamps, result.trajectory, relations, delay).translations.mean
     sides = [(1.0, 1.0, 1.0), (1.0, -1.0, -1.0)][: 2 if folder.name in MIRRORED else 1]
     truth = true_path(folder, log) if truth is None else truth
     # Some of them have one odometry pose in many seconds.

@@ -8,14 +8,14 @@ from helpers.planted import wander
 
 from uwblite import se2
 from uwblite.errors import DataError
-from uwblite.evaluation.relations import Relations, evaluate_relations
+from uwblite.evaluation.relations import evaluate_relations
 from uwblite.evaluation.trajectory import covered
 
 
 def related(stamps, poses, pairs):
     """Return the true relations between samples (r, 2) of a trajectory."""
     i, j = np.asarray(pairs).T
-    return Relations(stamps[i], stamps[j], se2.between(poses[i], poses[j]))
+    return (stamps[i], stamps[j], se2.between(poses[i], poses[j]))
 
 
 def test_the_truth_has_no_error_in_whatever_frame_and_order():
@@ -33,7 +33,7 @@ def test_errors_are_those_of_the_relative_pose():
     """Straight on for 2 m, the second half 0.6 m too far to the left and turned by 0.1 rad."""
     stamps = np.arange(5.0)
     poses = np.column_stack([0.5 * stamps, np.zeros(5), np.zeros(5)])
-    relations = Relations(stamps[[0, 0, 3]], stamps[[1, 4, 4]], np.array([[0.5, 0, 0], [2.0, 0, 0], [0.5, 0, 0]]))
+    relations = (stamps[[0, 0, 3]], stamps[[1, 4, 4]], np.array([[0.5, 0, 0], [2.0, 0, 0], [0.5, 0, 0]]))
     wrong = poses.copy()
     wrong[3:] = se2.compose(np.array([1.5, 0.6, 0.1]), se2.between(poses[3], poses[3:]))
     found = evaluate_relations(stamps, wrong, relations)
@@ -48,7 +48,7 @@ def test_poses_are_asked_at_the_lidars_clock():
     stamps, truth = wander(np.random.default_rng(3), 20.0)
     taken = np.linspace(1.0, stamps[-1] - 1.0, 40)
     at = se2.interpolate_trajectory(stamps, truth, taken)
-    relations = Relations(taken[:-1] - 0.25, taken[1:] - 0.25, se2.between(at[:-1], at[1:]))
+    relations = (taken[:-1] - 0.25, taken[1:] - 0.25, se2.between(at[:-1], at[1:]))
     assert evaluate_relations(stamps, truth, relations, delay=0.25).translations.max < 1e-9
     assert evaluate_relations(stamps, truth, relations).translations.max > 1e-3
 
@@ -57,17 +57,17 @@ def test_relations_without_an_answer_are_failures():
     stamps = np.concatenate([np.arange(0.0, 10.0), np.arange(40.0, 50.0)])
     poses = np.zeros((20, 3))
     first, second = np.array([1.0, 2.0, -3.0, 45.0]), np.array([3.0, 20.0, 1.0, 51.0])
-    found = evaluate_relations(stamps, poses, Relations(first, second, np.zeros((4, 3))))
+    found = evaluate_relations(stamps, poses, (first, second, np.zeros((4, 3))))
     np.testing.assert_array_equal(found.answered, [True, False, False, False])
     assert found.translations.count == 1
     assert found.far == 0.75
     with pytest.raises(DataError, match="answers none of the 1 relations"):
-        evaluate_relations(stamps, poses, Relations(first[1:2], second[1:2], np.zeros((1, 3))))
+        evaluate_relations(stamps, poses, (first[1:2], second[1:2], np.zeros((1, 3))))
 
 
 def test_scans_at_the_ends_are_answered_though_the_clock_is_late():
     stamps = np.arange(0.0, 10.0, 0.1)
-    ends = Relations(stamps[:1], stamps[-1:], np.zeros((1, 3)))
+    ends = (stamps[:1], stamps[-1:], np.zeros((1, 3)))
     for delay in (-0.15, 0.15):
         assert evaluate_relations(stamps, np.zeros((len(stamps), 3)), ends, delay).answered.all()
 

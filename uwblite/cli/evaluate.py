@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import ConfigError, FormatError, UsageError
 from ..evaluation.map import LandmarkErrors, Landmarks, find_columns, landmark_errors, landmark_errors_along
-from ..evaluation.relations import FAR, RelationErrors, Relations, evaluate_relations
+from ..evaluation.relations import FAR, RelationErrors, evaluate_relations
 from ..evaluation.trajectory import (
     AnchorErrors,
     Paired,
@@ -95,7 +95,7 @@ def _relations(folder: Path, path: str, number: int) -> Shown:
     if number > len(result.trajectories):
         raise ConfigError(f"{folder} is a map of {len(result.trajectories)} recordings, not of {number}")
     trajectory = in_order(*result.trajectories[number - 1])
-    errors = evaluate_relations(*trajectory, Relations(*read_relations(path)), result.laser_delay)
+    errors = evaluate_relations(*trajectory, read_relations(path), result.laser_delay)
     return _shown_relations(errors, result.laser_delay)
 
 

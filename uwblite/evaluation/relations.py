@@ -22,19 +22,8 @@ _LONGEST_GAP = 10.0
 """Time between poses of the trajectory over which a relation is not answered, s."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Relations:
-    """Given relative poses of scans."""
-
-    first: Floats
-    """(r,) s, stamp of the scan from which the other is seen, on the lidar's clock."""
-    second: Floats
-    """(r,) s, stamp of the scan that is seen."""
-    T_first_second: Floats
-    """(r, 3) m, m, rad."""
-
-    def __len__(self) -> int:
-        return len(self.first)
+Relations = tuple[Floats, Floats, Floats]
+"""Stamps (r,), s, on the lidar's clock, of scans and of others that are seen from them, and poses T_first_second (r, 3)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,16 +54,16 @@ def evaluate_relations(stamps: Floats, poses: Floats, relations: Relations, dela
     ------
     DataError : the trajectory answers none of them.
     """
-    first, second = relations.first + delay, relations.second + delay
+    first, second, T_first_second = relations[0] + delay, relations[1] + delay, relations[2]
     # The trajectory's ends may be overhung by the offset of the clock.
     answered = np.logical_and(*(covered(stamps, at, _LONGEST_GAP, abs(delay) + EDGE) for at in (first, second)))
     if not answered.any():
         raise DataError(
-            f"the trajectory ({stamps[0]:.3f} .. {stamps[-1]:.3f} s) answers none of the {len(relations)} relations"
-            f" (from {min(relations.first.min(), relations.second.min()):.3f} s on): are both of the same recording?"
+            f"the trajectory ({stamps[0]:.3f} .. {stamps[-1]:.3f} s) answers none of the {len(answered)} relations"
+            f" (from {min(first.min(), second.min()) - delay:.3f} s on): are both of the same recording?"
         )
     start, end = (se2.interpolate_trajectory(stamps, poses, at[answered]) for at in (first, second))
-    error = se2.between(relations.T_first_second[answered], se2.between(start, end))
+    error = se2.between(T_first_second[answered], se2.between(start, end))
     translation, rotation = np.hypot(error[:, 0], error[:, 1]), np.abs(se2.wrap_angle(error[:, 2]))
-    far = float((np.sum(translation > FAR) + np.sum(~answered)) / len(relations))
+    far = float((np.sum(translation > FAR) + np.sum(~answered)) / len(answered))
     return RelationErrors(translation, rotation, answered, statistics(translation), statistics(rotation), far)
