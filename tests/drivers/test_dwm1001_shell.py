@@ -37,14 +37,14 @@ def transcript():
         b"POS,0,4D18,-1.31,0.17,0.39,47,x01\r\n", b"[000044.950 INF] uwb0: panid=xBACA addr=xDECADDF048951512\r\n",
     ]  # fmt: skip
     expected = [
-        Prompt(1.0), TextLine(1.0, "lec"), Prompt(1.0),
+        Prompt(), TextLine("lec"), Prompt(),
         RangeLine(1.0, (*TWO, RangeReading("F00D", 4.56, 100)), "lec"),
         RangeLine(1.0, TWO[:1], "lec"),
         RangeLine(1.0, TWO, "les"),
         RangeLine(1.0, TWO, "les"),
-        PositionLine(1.0),
-        PositionLine(1.0),
-        TextLine(1.0, "[000044.950 INF] uwb0: panid=xBACA addr=xDECADDF048951512"),
+        PositionLine(),
+        PositionLine(),
+        TextLine("[000044.950 INF] uwb0: panid=xBACA addr=xDECADDF048951512"),
     ]  # fmt: skip
     return frames, expected
 
@@ -98,12 +98,12 @@ def test_captured_static_ranges_have_the_stated_spread(shared_data):
 
 def test_captured_node_info(shared_data):
     """What the shell says of a node is what the binary interface would have answered."""
-    facts = node_facts((shared_data / "captures" / "dwm_shell_misc.txt").read_text().splitlines(), 1.0)
+    facts = node_facts((shared_data / "captures" / "dwm_shell_misc.txt").read_text().splitlines())
     assert [event for event in facts if isinstance(event, Value)][1:] == [
-        Value(1.0, "pan_id", 0xBACA), Value(1.0, "firmware", 0x01030001)
+        Value("pan_id", 0xBACA), Value("firmware", 0x01030001)
     ]  # fmt: skip
     assert facts[0].value & 0xFFFF == 0x1512
-    assert facts[3:] == [Status(1.0, 0), NodeConfig(1.0, False, False, False, 0), UpdateRate(1.0, 0.1, 0.1)]
+    assert facts[3:] == [Status(0), NodeConfig(False, False, False, 0), UpdateRate(0.1, 0.1)]
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ class Create2Driver(BaseDriver):
         stamp = self._stamp(event)
         pause = event.stamp - last.stamp if last is not None else 0.0
         if pause > STALL:
-            actions.append(Lost(stamp, round(pause / PERIOD) - 1))
+            actions.append(Lost(round(pause / PERIOD) - 1))
         way = 0.0 if last is None else way_of((event.left - last.left, event.right - last.right), MODULUS, TICK)
         if pause > MAX_BLIND or way > MAX_SPEED * max(pause, STALL):  # more than it can drive: the counts began again
             self._odometer.forget()

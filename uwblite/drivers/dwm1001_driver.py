@@ -208,7 +208,7 @@ class Dwm1001Driver(Driver):
         while (event := (yield Wait(until))) is not None and not (texts and isinstance(event, Prompt)):
             if isinstance(event, TextLine):
                 texts.append(event.text)
-        self._learn(node_facts(texts, self.now))
+        self._learn(node_facts(texts))
 
     def _read_lines(self) -> Script[None]:
         """Read the stream until no more lines come; the command toggles it, so it is sent until they do, while it is echoed."""
@@ -230,7 +230,7 @@ class Dwm1001Driver(Driver):
         """Log a line. It has no sum: a range that leaps or a new anchor must come again."""
         gap = round((line.stamp - self._last_line) / self.period) - 1 if self._last_line else 0
         if gap > 0 and self._missed:
-            yield Lost(line.stamp, gap)
+            yield Lost(gap)
         self._last_line, self._missed = line.stamp, False
         yield from self._guard.take(RangeEpoch(line.stamp, line.readings), self.now)
 

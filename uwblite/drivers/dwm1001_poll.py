@@ -148,7 +148,7 @@ class FixPoller:
             yield from self._driver.say_once(_slow(high - low))
         gap = round((stamp - self._last_fix) / self._period) - 1 if self._latest is not None else 0
         if (gap > 0 and self._missed) or unsure:
-            yield Lost(stamp, max(0, gap) + unsure)
+            yield Lost(max(0, gap) + unsure)
         narrow = high - low < 2 * (DENSE + (self._trip or 0.0)) + LEAD
         self._lead = max(LEAD, self._lead * LESS_LEAD) if narrow else min(self._lead + MORE_LEAD, self._period / 2)
         self._last_fix, self._latest = stamp, readings

@@ -25,8 +25,6 @@ MAX_RANGE = 200.0
 class Prompt:
     """``dwm> ``: the shell waits for a command."""
 
-    stamp: float
-
 
 @dataclass(frozen=True, slots=True)
 class RangeLine:
@@ -43,14 +41,11 @@ class RangeLine:
 class PositionLine:
     """One line of ``lep``; on a listener it is of another tag."""
 
-    stamp: float
-
 
 @dataclass(frozen=True, slots=True)
 class TextLine:
     """Any other line that the shell prints."""
 
-    stamp: float
     text: str
 
 
@@ -93,7 +88,7 @@ class ShellProtocol:
             if line.data.strip():
                 events += _parse(line)
             if line.end == PROMPT:
-                events.append(Prompt(stamp))
+                events.append(Prompt())
         return events
 
 
@@ -155,40 +150,40 @@ def _checked(line: RangeLine) -> Event:
     return line
 
 
-def _find_position(text: str, stamp_at: StampAt) -> Found:
+def _find_position(text: str, _stamp_at: StampAt) -> Found:
     start = text.rfind("POS,")
     if start < 0:
         return 0, None
     # Behind the rows of a broken lec line a position is the end of that line.
     if _LISTENER.match(text, start) or (_POS.match(text, start) and not ("DIST," in text and text[:start].endswith(","))):
-        return start, PositionLine(stamp_at(start))
+        return start, PositionLine()
     return start, Corrupt("lep line cut or garbled")
 
 
-def _find_text(text: str, stamp_at: StampAt) -> Found:
+def _find_text(text: str, _stamp_at: StampAt) -> Found:
     row = _LOG_ROW.search(text)
     if row and text[row.start() :].isprintable():
-        return row.start(), TextLine(stamp_at(row.start()), text[row.start() :])
+        return row.start(), TextLine(text[row.start() :])
     stripped = text.strip()
     known = _ANSWER.match(stripped) or _COMMAND.fullmatch(stripped.partition(" ")[0])
-    return 0, TextLine(stamp_at(0), stripped) if known and stripped.isprintable() else None
+    return 0, TextLine(stripped) if known and stripped.isprintable() else None
 
 
 ACTIVITY = {"off": 0, "pasv": 1, "act": ACTIVE}
 """Of the radio: ``uwb_mode`` of a configuration."""
 
 
-def node_facts(lines: Sequence[str], stamp: float) -> list[Fact]:
+def node_facts(lines: Sequence[str]) -> list[Fact]:
     """Return what the text lines of `si` (or the one of `nmg`) say of a node, as its binary interface answers it."""
     text = "\n".join(lines)
     numbers = {"node_id": r"addr=x([0-9A-F]{16})", "pan_id": r"panid=x([0-9A-F]{1,4})", "firmware": r"fw_ver=x([0-9a-fA-F]{8})"}
     matches = {name: re.search(form, text) for name, form in numbers.items()}
-    facts: list[Fact] = [Value(stamp, name, int(match[1], 16)) for name, match in matches.items() if match]
+    facts: list[Fact] = [Value(name, int(match[1], 16)) for name, match in matches.items() if match]
     if joined := re.search(r"uwbmac: (connected|disconnected)", text):
-        facts.append(Status(stamp, JOINED if joined[1] == "connected" else 0))
+        facts.append(Status(JOINED if joined[1] == "connected" else 0))
     row, mode = re.search(r"cfg: (.*)", text), re.search(r"mode: (\w+) \((\w+)", text)
     settings: dict[str, str] = dict(re.findall(r"(\w+)=(\S+)", row[1])) if row else {}
     anchor, activity = (mode[1] != "tn", ACTIVITY.get(mode[2], 0)) if mode else (False, ACTIVE)
-    facts.append(NodeConfig(stamp, anchor, settings.get("stat_det") == "1", settings.get("lp") == "1", activity))
+    facts.append(NodeConfig(anchor, settings.get("stat_det") == "1", settings.get("lp") == "1", activity))
     normal = settings.get("upd_rate_norm", "1")
-    return [*facts, UpdateRate(stamp, int(normal) / 10, int(normal) / 10)] if normal.isdecimal() else facts
+    return [*facts, UpdateRate(int(normal) / 10, int(normal) / 10)] if normal.isdecimal() else facts

@@ -36,8 +36,6 @@ ERRORS = ("ok", "unknown command or broken request", "internal error", "invalid 
 class Answer:
     """Head of an answer."""
 
-    stamp: float
-    """s, arrival of its first byte."""
     error: int
     """Index into ERRORS."""
 
@@ -46,8 +44,6 @@ class Answer:
 class Distances:
     """Distances of the latest fix."""
 
-    stamp: float
-    """s, arrival of the block's first byte."""
     readings: tuple[RangeReading, ...]
 
 
@@ -55,7 +51,6 @@ class Distances:
 class Status:
     """Status word."""
 
-    stamp: float
     bits: int
 
     @property
@@ -77,7 +72,6 @@ JOINED = 2
 class UpdateRate:
     """Periods of the fixes."""
 
-    stamp: float
     normal: float
     stationary: float
     """s."""
@@ -87,7 +81,6 @@ class UpdateRate:
 class NodeConfig:
     """Configuration word of cfg_get."""
 
-    stamp: float
     anchor: bool
     """Not a tag."""
     stationary_detection: bool
@@ -103,7 +96,6 @@ ACTIVE = 2
 class Value:
     """Any other block that is a number."""
 
-    stamp: float
     name: str
     """"firmware", "configuration", "hardware", "pan_id" or "node_id"; of a position, which is not used, its quality."""
     value: int
@@ -144,37 +136,37 @@ def block_length(head: bytes) -> int:
     return length if len(head) > 2 else 0
 
 
-def decode(piece: bytes, stamp: float) -> Event:
+def decode(piece: bytes) -> Event:
     """Decode a head or a block of the right size."""
     kind, value = piece[0], piece[2:]
     if kind == 0x40:
-        return Answer(stamp, piece[2])
+        return Answer(piece[2])
     if kind == 0x41:
         x, y, z, quality = _POSITION.unpack(value)
         if quality > 100 or max(abs(x), abs(y), abs(z)) > MAX_PLACE_MM:
             return Corrupt("position or quality out of range")
-        return Value(stamp, "position quality", quality)
+        return Value("position quality", quality)
     if kind == 0x45:
         normal, stationary = struct.unpack("<HH", value)
-        return UpdateRate(stamp, normal / 10, stationary / 10)
+        return UpdateRate(normal / 10, stationary / 10)
     if kind == 0x46:
-        return _decode_config(value, stamp)
+        return _decode_config(value)
     if kind == 0x5A:
         bits = int.from_bytes(value, "little")
         if bits == _HEAD_AS_STATUS:
             return Corrupt("the head of an answer instead of a status")
-        return Status(stamp, bits)  # a firmware may set bits that the guide does not name
+        return Status(bits)  # a firmware may set bits that the guide does not name
     if kind in _VALUES:
-        return Value(stamp, _VALUES[kind][1], int.from_bytes(value, "little"))
-    return _decode_distances(piece, stamp)
+        return Value(_VALUES[kind][1], int.from_bytes(value, "little"))
+    return _decode_distances(piece)
 
 
-def _decode_config(value: bytes, stamp: float) -> NodeConfig:
+def _decode_config(value: bytes) -> NodeConfig:
     low, high = value
-    return NodeConfig(stamp, bool(high & 32), bool(high & 4), bool(low & 128), low & 3)
+    return NodeConfig(bool(high & 32), bool(high & 4), bool(low & 128), low & 3)
 
 
-def _decode_distances(piece: bytes, stamp: float) -> Event:
+def _decode_distances(piece: bytes) -> Event:
     rows = piece[3:]
     if piece[0] == 0x49:
         table = list(_TAG_ROW.iter_unpack(rows))
@@ -186,7 +178,7 @@ def _decode_distances(piece: bytes, stamp: float) -> Event:
         return Corrupt("distance or quality out of range")
     if len({address for address, _, _ in readings}) < len(readings):
         return Corrupt("one anchor twice in a fix")
-    return Distances(stamp, tuple([RangeReading(short_id(a), d / 1000, q) for a, d, q in readings]))
+    return Distances(tuple([RangeReading(short_id(a), d / 1000, q) for a, d, q in readings]))
 
 
 class TlvProtocol(HeadedFrames):
@@ -227,7 +219,7 @@ class TlvProtocol(HeadedFrames):
         return 0 if end > len(buffer) else end - offset
 
     def decode(self, frame: bytes, stamp: float) -> Event:
-        event = decode(frame, stamp)
+        event = decode(frame)
         self._inside = not isinstance(event, Corrupt) and not (isinstance(event, Answer) and event.error)
         return event
 

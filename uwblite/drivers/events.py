@@ -140,8 +140,6 @@ class GyroHeading:
 class Lost:
     """The device numbers or times its frames, and some are missing."""
 
-    stamp: float
-    """s, host clock, of the first frame after the gap."""
     count: int
     """Frames missing."""
 

@@ -136,7 +136,7 @@ class KobukiDriver(BaseDriver):
         # The gyro's angle is absolute, so the heading holds over any gap; the travel is ambiguous after a long one.
         elapsed = reading.elapsed or max(event.stamp - last.stamp, PERIOD)
         travel, _ = self._odometer.update(event.left, event.right, event.heading, still=elapsed > MAX_GUESS)
-        actions: list[Action] = [Lost(reading.stamp, reading.missing)] if reading.missing else []
+        actions: list[Action] = [Lost(reading.missing)] if reading.missing else []
         if restarted or elapsed > MAX_BLIND:
             silent = f"sent nothing for {elapsed:.1f} s: how far it went"
             actions.append(self.gap("restarted, the pose is held: its motion" if restarted else silent))

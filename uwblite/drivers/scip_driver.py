@@ -184,7 +184,7 @@ class ScipDriver(ScipUnit):
             yield Corrupt("scan sent twice")
             return
         if reading.missing:
-            yield Lost(reading.stamp, reading.missing)
+            yield Lost(reading.missing)
         yield self._laser_scan(scan, reading)
 
     def _laser_scan(self, scan: Distances, reading: Reading) -> LaserScan:

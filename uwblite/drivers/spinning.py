@@ -226,7 +226,7 @@ class SpinningDriver(Driver):
         scans: Sequence[LaserScan] = self._assembler.add(times, event)
         lost += self._assembler.lost
         self._assembler.lost = 0
-        return [*([Lost(times[0], lost)] if lost else []), *scans]
+        return [*([Lost(lost)] if lost else []), *scans]
 
     def _device_time(self, samples: Samples, clock: DeviceClock) -> tuple[float, int]:
         """Return the host time of the last reading, s, and the turns that are missing before it."""

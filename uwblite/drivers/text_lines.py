@@ -168,7 +168,7 @@ class LineDriver(Driver, ABC):
         if time is None:
             return line.stamp, None, []
         reading = self.clock.read(time, line.stamp)
-        return reading.stamp, reading.elapsed, [Lost(reading.stamp, reading.missing)] if reading.missing else []
+        return reading.stamp, reading.elapsed, [Lost(reading.missing)] if reading.missing else []
 
     def stop(self) -> list[Action]:
         return self._series.unconfirmed()

@@ -249,7 +249,7 @@ class UwbDriver(LineDriver):
 
     def _ranges(self, line: Line) -> list[Action]:
         self.ready, content = True, line.content
-        actions: list[Action] = [Lost(line.stamp, count)] if (count := self._missed(content)) else []
+        actions: list[Action] = [Lost(count)] if (count := self._missed(content)) else []
         stamp, _, lost = self.timed(line)
         actions += lost
         self._empty = 0 if content.readings else self._empty + 1
