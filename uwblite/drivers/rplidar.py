@@ -93,7 +93,7 @@ class RpLidarProtocol(PacketReader):
             return self._capsule(frame, stamp)
         if len(frame) == NODE * TOGETHER:
             return self._nodes(frame, stamp)
-        reply = slamtec.decode_reply(frame, stamp)
+        reply = slamtec.decode_reply(frame)
         if reply.kind == PERIODS_REPLY:
             standard, express = struct.unpack("<HH", reply.payload)
             self.periods = (standard * 1e-6, express * 1e-6) if standard and express else self.periods

@@ -27,8 +27,6 @@ DESCRIPTOR = 7
 class Reply:
     """What the lidar answered."""
 
-    stamp: float
-    """s, arrival of its first byte."""
     kind: int
     """Type of the reply."""
     payload: bytes
@@ -62,8 +60,8 @@ def reply_size(buffer: bytearray, offset: int, kinds: dict[int, int]) -> int:
     return size if offset + size <= len(buffer) else 0
 
 
-def decode_reply(data: bytes, stamp: float) -> Reply:
-    return Reply(stamp, data[DESCRIPTOR - 1], data[DESCRIPTOR:])
+def decode_reply(data: bytes) -> Reply:
+    return Reply(data[DESCRIPTOR - 1], data[DESCRIPTOR:])
 
 
 def answers(kind: int) -> Callable[[Any], bool]:

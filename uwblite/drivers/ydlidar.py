@@ -68,7 +68,7 @@ class YdLidarProtocol(PacketReader):
 
     def decode(self, frame: bytes, stamp: float) -> Samples | Reply:
         if frame[0] == SYNC:
-            return decode_reply(frame, stamp)
+            return decode_reply(frame)
         count = frame[3]
         first, last = (angle >> 1 for angle in struct.unpack_from("<HH", frame, 4))
         quarters = struct.unpack_from(f"<{count}H", frame, HEADER)
