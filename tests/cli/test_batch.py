@@ -113,14 +113,14 @@ def test_a_process_that_is_killed_costs_its_own_recording_alone(recordings, tmp_
     monkeypatch.setattr(batch, "map_one", killed_on_notes)
     tasks = batch.tasks_of(batch_args(recordings, tmp_path))
     outcomes = dict(batch._outcomes(dict(enumerate(tasks)), batch_args(recordings, tmp_path, "--jobs", "2")))
-    assert [outcomes[k].code for k in range(3)] == [0, 1, 0]
+    assert [bool(outcomes[k].error) for k in range(3)] == [False, True, False]
     assert "killed" in outcomes[1].error
 
 
 def killed_on_notes(task):
     if task.logs[0].endswith("notes.log"):
         os.kill(os.getpid(), signal.SIGKILL)
-    return batch.Outcome(0)
+    return batch.Outcome()
 
 
 def batch_args(recordings, out, *more):

@@ -25,8 +25,6 @@ from .workers import cluster, processes, versions
 class Outcome(NamedTuple):
     """What a worker says of a recording; its figures stand in report.json."""
 
-    code: int
-    """Exit code as of `uwblite map`."""
     error: str = ""
     notes: tuple[str, ...] = ()
 
@@ -83,7 +81,7 @@ def folder_names(logs: Sequence[str]) -> list[str]:
 def _rows(args: argparse.Namespace, tasks: Sequence[argparse.Namespace]) -> list[BatchRow]:
     """Map what is not there yet; write the table after every recording."""
     finished = {k for k, task in enumerate(tasks) if is_finished(task)}
-    rows = {k: _row(args.logs[k], tasks[k], Outcome(0)) for k in sorted(finished)}
+    rows = {k: _row(args.logs[k], tasks[k], Outcome()) for k in sorted(finished)}
     if finished:
         console.note(f"uwblite: {len(finished)} of {len(tasks)} recordings are mapped already")
     _write_table(args.out, rows)
@@ -129,11 +127,10 @@ def map_one(task: argparse.Namespace) -> Outcome:
             warnings.simplefilter("ignore", RuntimeWarning)
             check_target(task.out, force=task.force)
             maps = 1 if task.scheduler else task.jobs
-            made = make(task, read_logs(task), note=notes.append, maps=maps)
+            make(task, read_logs(task), note=notes.append, maps=maps)
     except Exception as error:
-        code, text = failure(error)
-        return Outcome(code, text)
-    return Outcome(3 if made.result.doubts else 0, notes=tuple(notes))
+        return Outcome(failure(error)[1])
+    return Outcome(notes=tuple(notes))
 
 
 def _outcomes(tasks: dict[int, argparse.Namespace], args: argparse.Namespace) -> Iterator[tuple[int, Outcome]]:
@@ -153,7 +150,7 @@ def _outcomes(tasks: dict[int, argparse.Namespace], args: argparse.Namespace) ->
     for k in sorted(broken):
         with processes(1) as executor:
             for _, outcome in _as_they_come({k: tasks[k]}, executor):
-                yield k, outcome or Outcome(1, "its process was killed; too little memory? see the system's log")
+                yield k, outcome or Outcome("its process was killed; too little memory? see the system's log")
 
 
 def _as_they_come(tasks: dict[int, argparse.Namespace], executor: Executor) -> Iterator[tuple[int, Outcome | None]]:
@@ -164,7 +161,7 @@ def _as_they_come(tasks: dict[int, argparse.Namespace], executor: Executor) -> I
         if isinstance(error, BrokenExecutor):
             yield futures[future], None
         elif error is not None:
-            yield futures[future], Outcome(*failure(error))
+            yield futures[future], Outcome(failure(error)[1])
         else:
             yield futures[future], future.result()
 
