@@ -375,6 +375,21 @@ def test_places_that_look_alike_leave_and_those_that_are_right_stay():
             assert [c.accepted for c in left.candidates] == right.tolist()
 
 
+@pytest.mark.parametrize(("shared", "believed"), [(10, False), (180, True)])
+def test_a_slip_is_believed_where_a_long_way_shows_it(shared, believed):
+    """The wheels slip between two laps; one place by itself may be a copy, a long way that both laps share is none."""
+    lap, rng = 250, np.random.default_rng(2)
+    truth = chain(np.zeros(3), np.tile([1.0, 0.0, 2.0 * np.pi / lap], (2 * lap, 1)))
+    graph = drifted(rng, truth, NOISE)
+    wheels = replace(graph.edges[0], kernel=Kernel("cauchy", 5.0))
+    wheels.motion[lap] += [2.0, 1.0, 0.6]
+    first = np.arange(lap - 10 - shared, lap - 9, 10)
+    edges = relative_edges(truth, first, first + lap, [0.05, 0.05, 0.01], rng)
+    solved, _ = optimize(replace(graph, poses=truth, edges=(wheels, edges)), SOLVER)
+    _, left = without_look_alikes(replace(solved, edges=(wheels,)), recorded(edges), np.arange(2.0 * lap), SOLVER)
+    assert [c.accepted for c in left.candidates] == [believed] * len(first)
+
+
 def test_a_place_that_nothing_contradicts_stays():
     graph = drifted(np.random.default_rng(0), chain(np.zeros(3), np.tile([1.0, 0.0, 0.1], (63, 1))), NOISE)
     away = recorded(RelativePoseEdges(np.array([0]), np.array([62]), np.array([[0.0, 0.0, 1.0]]), 20.0 * np.eye(3)[None]))

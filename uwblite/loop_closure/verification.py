@@ -113,7 +113,8 @@ def without_look_alikes(graph: Graph, closures: Closures, path: Floats, solver: 
     """Drop closures of places that only look alike: without them all other measurements are far more probable.
 
     All closures between the same stretches of the path are one piece of evidence, however many: a copy of a place matches
-    everywhere. The group that costs the others most leaves first, since it makes those that are right cost as much.
+    everywhere. Each further length of a stretch that two visits share is another place that would have to look alike. The group
+    that costs the others most leaves first, since it makes those that are right cost as much.
 
     Parameters
     ----------
@@ -126,26 +127,29 @@ def without_look_alikes(graph: Graph, closures: Closures, path: Floats, solver: 
     quick = replace(solver, relative_decrease=_ROUGH)
     most = CandidatePolicy.wider**2 * chdtri(se2.POSE[0], CandidatePolicy.never)
     while len(closures.edges):
-        group = _meetings(closures.edges, path)
+        group, shared = _meetings(closures.edges, path)
         costs, solved = [], []
         for number in range(group.max() + 1):
             rest = graph.with_edges(closures.edges.rows(np.flatnonzero(group != number)))
             solved.append(optimize(rest, quick)[0])
-            costs.append(_cost(rest) - _cost(solved[-1]))
+            costs.append((_cost(rest) - _cost(solved[-1])) / (1.0 + shared[number] / CandidatePolicy.length))
         worst = int(np.argmax(costs))
         if costs[worst] <= most:
             break
-        reason = f"a place that looks alike: without it chi2 of all others falls by {costs[worst]:.0f} (most {most:.0f})"
+        reason = f"it looks alike: without it chi2 of all others falls by {costs[worst]:.0f} per place (most {most:.0f})"
         closures = closures.without(group != worst, "contradicts-graph", [reason] * len(group))
         graph = replace(solved[worst], edges=graph.edges)
     return graph, closures
 
 
-def _meetings(edges: RelativePoseEdges, path: Floats) -> Ints:
-    """Return for each closure (e,) the number of the group that connects the same two stretches of the path (k,), m."""
+def _meetings(edges: RelativePoseEdges, path: Floats) -> tuple[Ints, Floats]:
+    """Return for each closure (e,) the number of the group that connects the same two stretches of the path (k,), m, and the
+    length (g,) that both visits of a group share, m."""
     ends = np.sort(path[np.stack([edges.i, edges.j])], axis=0)
     near = (np.abs(ends[:, :, None] - ends[:, None]) < CandidatePolicy.length).all(axis=0)
-    return np.asarray(connected_components(near, directed=False)[1], dtype=np.intp)
+    count, group = connected_components(near, directed=False)
+    shared = [float(np.ptp(ends[:, group == number], axis=1).min()) for number in range(count)]
+    return np.asarray(group, dtype=np.intp), np.array(shared)
 
 
 def _cost(graph: Graph) -> float:
