@@ -10,16 +10,15 @@ cost by Schwarz, 1978), with Cauchy errors; that of a drive of which only the wa
 any numbers, where they are no distances. An anchor may be moved by itself at any moment.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-from scipy.special import gammaln
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 from ..findings import Fact
 from ..problem.alternatives import EvidencePolicy
 from ..sensor_log import SensorLog, plausible
@@ -100,12 +99,14 @@ def explained_by_ranges(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     traces = _traces(log)
     if not traces:
         return log, []
-    late, moments = _late(log, traces), _at_moments(log, traces)
-    if late.log_odds > EvidencePolicy.very_strong and log.ranges is not None:
+    late = _late(log, traces)
+    is_late = late.log_odds > EvidencePolicy.very_strong
+    moments = _at_moments(log, traces, to_compare=is_late)
+    if is_late and log.ranges is not None:
         stamps, (first, last) = log.ranges.stamps, log.odometry.stamps[[0, -1]]
         grown = late.figures["late"] + late.figures["grows"] * (stamps - first) / (last - first)
         in_time = replace(log, ranges=replace(log.ranges, stamps=stamps - grown))
-        left = _at_moments(in_time, _traces(in_time))
+        left = _at_moments(in_time, _traces(in_time), to_compare=True)
         # A clock that is off contradicts the path at many moments; set right, at fewer.
         if _most(left) <= _most(moments):
             return in_time, [Fact.of(late.kind, **late.figures), *_facts(_with_names_undone(in_time, left), in_time)]
@@ -130,7 +131,7 @@ def _with_names_undone(log: SensorLog, rows: list[Explanation]) -> list[Explanat
         others = np.array([ranges.anchor_ids.index(row.names.get(name, name)) for name in ranges.anchor_ids], dtype=np.intp)
         anchor = np.where(ranges.stamps > at, others[ranges.anchor], ranges.anchor)
         undone = replace(log, ranges=replace(ranges, anchor=anchor))
-        left = _at_moments(undone, _traces(undone), row)
+        left = _at_moments(undone, _traces(undone), row, to_compare=True)
         if row in rows and _most(left) < min(_most(near) - EvidencePolicy.very_strong, row.log_odds):
             rows, log = [row, *left, *(other for other in rows if other not in near)], undone
     return rows
@@ -225,25 +226,31 @@ def _on_stretch(log: SensorLog, traces: Sequence[Trace], offsets: Floats, longes
     return np.asarray(np.logaddexp(likely, np.log(PathPolicy.wheels) + np.logaddexp(lost, of_any)))
 
 
-def _at_moments(log: SensorLog, traces: Sequence[Trace], near: Explanation | None = None) -> list[Explanation]:
+def _at_moments(
+    log: SensorLog, traces: Sequence[Trace], near: Explanation | None = None, *, to_compare: bool = False
+) -> list[Explanation]:
     """Return names that are exchanged, and paths that go on elsewhere, from a moment on.
 
     About each moment the readings of a stretch before and after it are compared, in the frame of the robot at that moment;
-    where another explanation is given, at moments whose stretches meet its own.
+    where another explanation is given, at moments whose stretches meet its own. To compare recordings, other paths count which
+    are hardly likely enough to be told.
     """
     odometry, half, rows = log.odometry, PathPolicy.stretch, list[Explanation]()
-    way = odometry.travelled
+    way, sides = odometry.travelled, dict[float, Side]()
     longest = max(float(trace.ranges.max(initial=0.0)) for trace in traces)
     for at in np.arange(half, float(way[-1]) - half, 0.25 * half).tolist():
         if near is not None and (at + half <= near.begin or near.end <= at - half):
             continue
-        origin = se2.inverse(odometry.at(np.array([np.interp(at, way, odometry.stamps)]))[0])
-        sides = [(trace.between(at - half, at), trace.between(at, at + half)) for trace in traces]
-        sides = [side for side in sides if min(len(trace.ranges) for trace in side) >= PathPolicy.fewest]
-        if sides:
-            before, after = (Side.of(parts, origin, longest) for parts in zip(*sides, strict=True))
-            moment = Moment(before, after, [trace.anchor for trace, _ in sides])
-            rows += [replace(row, begin=at - half, end=at + half) for row in moment.rows()]
+        # What is after one moment is before another.
+        for begin in (at - half, at):
+            if begin not in sides:
+                sides[begin] = Side.of([trace.between(begin, begin + half) for trace in traces], longest)
+        before, after = sides[at - half], sides[at]
+        own = np.flatnonzero(np.minimum(before.counts, after.counts) >= PathPolicy.fewest)
+        if len(own):
+            origin = se2.inverse(odometry.at(np.array([np.interp(at, way, odometry.stamps)]))[0])
+            moment = Moment(before.seen(origin, own), after.seen(origin, own), [traces[k].anchor for k in own.tolist()])
+            rows += [replace(row, begin=at - half, end=at + half) for row in moment.rows(to_compare)]
     return rows
 
 
@@ -251,6 +258,8 @@ def _at_moments(log: SensorLog, traces: Sequence[Trace], near: Explanation | Non
 class Side:
     """Readings of several anchors on one stretch, filled up to the most that one of them has."""
 
+    traces: Sequence[Trace]
+    """(a,) the readings of each."""
     places: Floats
     """(a, n, 2) of the base, m."""
     ranges: Floats
@@ -259,21 +268,41 @@ class Side:
     """(a, n) 1 for a reading, 0 for what fills up."""
     likely: Floats
     """(a, g) log likelihoods of the readings to one place each."""
-    driven: Floats
-    """(a, g) the same where only the way is known."""
-    nothing: Floats
-    """(a,) the same where ranges may be any numbers up to the longest."""
+    longest: float
+    """Of all ranges, m."""
 
     @staticmethod
-    def of(traces: Sequence[Trace], origin: Floats, longest: float) -> "Side":
-        """Fill up the readings of each anchor, places moved by a motion (3,), and fit them; longest: of all ranges, m."""
+    def of(traces: Sequence[Trace], longest: float) -> "Side":
+        """Fill up the readings of each anchor and fit a place to them."""
         counts = np.array([len(trace.ranges) for trace in traces])
-        counted = (np.arange(counts.max()) < counts[:, None]).astype(np.float64)
-        places, ranges = np.zeros((*counted.shape, 2)), np.ones(counted.shape)
-        for k, trace in enumerate(traces):
-            places[k, : counts[k]], ranges[k, : counts[k]] = se2.transform(origin, trace.places), trace.ranges
-        likely, driven = _best_place(places, ranges, counted).T, np.array([_by_way(trace, longest) for trace in traces])
-        return Side(places, ranges, counted, likely, driven, -counts * float(np.log(longest)))
+        there = np.arange(max(counts.max(), 1)) < counts[:, None]
+        places, ranges = np.zeros((*there.shape, 2)), np.ones(there.shape)
+        places[there] = np.concatenate([trace.places for trace in traces])
+        ranges[there] = np.concatenate([trace.ranges for trace in traces])
+        counted, enough = there.astype(np.float64), counts >= PathPolicy.fewest
+        likely = np.zeros((len(traces), len(PathPolicy.noise)))
+        likely[enough] = _best_place(places[enough], ranges[enough], counted[enough]).T
+        return Side(traces, places, ranges, counted, likely, longest)
+
+    def seen(self, origin: Floats, own: Ints) -> "Side":
+        """Return the readings of some anchors, places moved by a motion (3,)."""
+        places, traces = se2.transform(origin, self.places[own]), [self.traces[k] for k in own]
+        return Side(traces, places, self.ranges[own], self.counted[own], self.likely[own], self.longest)
+
+    @property
+    def counts(self) -> Floats:
+        """(a,) readings of each anchor."""
+        return np.asarray(self.counted.sum(axis=1))
+
+    @property
+    def driven(self) -> Floats:
+        """(a, g) log likelihoods of the readings where only the way is known."""
+        return np.array([_by_way(trace, self.longest) for trace in self.traces])
+
+    @property
+    def nothing(self) -> Floats:
+        """(a,) the same where ranges may be any numbers up to the longest."""
+        return np.asarray(-self.counts * float(np.log(self.longest)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -312,49 +341,86 @@ class Moment:
         return most
 
     def exchanged(self, motions: Floats) -> tuple[Ints, float]:
-        """Return which anchor each is after the moment (a,) if the path goes on by some motion (m, 3); its log likelihood."""
+        """Return which anchor each is after the moment (a,) if the path goes on by some motion (m, 3), and its log likelihood;
+        that of anchors which keep their names is no matter, and not refined."""
         each = np.arange(len(self.names))
         k, other = np.indices((len(each), len(each))).reshape(2, -1)
         pairs = self.same(k, other, motions).max(axis=0).reshape(len(each), len(each), len(motions))
-        orders = [linear_sum_assignment(-pairs[:, :, m])[1] for m in range(len(motions))]
-        best = int(np.argmax([pairs[each, order, m].sum() for m, order in enumerate(orders)]))
-        return orders[best], self.refined(motions[best : best + 1], PathPolicy.usual_motion, names=orders[best])
+        most, names, best, bound = -np.inf, each, 0, pairs.max(axis=1).sum(axis=0)
+        for m in np.argsort(-bound).tolist():
+            if bound[m] > most:
+                order = _best_order(pairs[:, :, m])
+                if (gain := float(pairs[each, order, m].sum())) > most:
+                    most, names, best = gain, order, m
+        if np.array_equal(names, each):
+            return each, most
+        return names, self.refined(motions[best : best + 1], PathPolicy.usual_motion, names=names)
 
-    def rows(self) -> Iterator[Explanation]:
-        """Yield what explains a change; nothing where nothing could: with all anchors at any place the path is no likelier."""
-        one, two, count, usual_motion = self.before, self.after, len(self.names), PathPolicy.usual_motion
+    def rows(self, to_compare: bool = False) -> Iterator[Explanation]:
+        """Yield what explains a change; nothing where nothing could.
+
+        Where the likelihood with all anchors at any place exceeds that of the path by no very strong evidence nothing needs an
+        explanation, and where not by the prior odds of wrong wheels as well, no other path does, unless it is to be compared.
+        """
+        one, two, usual_motion = self.before, self.after, PathPolicy.usual_motion
         turns = np.arange(-np.pi, np.pi, PathPolicy.turn)
         motions, usual = turns[:, None] * np.array([0.0, 0.0, 1.0]), np.abs(turns) < usual_motion
-        small, any_turn = motions[usual], motions[:: len(turns) // 12]
+        small = motions[usual]
         sound = float((one.likely + two.likely).sum(axis=0).max()) - EvidencePolicy.very_strong
         if float(self.likely(small).max()) > sound or (null := self.refined(small, usual_motion)) > sound:
             return
-        large = self.likely(motions[~usual])
-        turned = float(np.logaddexp.reduce(large)) - np.log(len(large))
-        lost = one.driven + two.likely, one.likely + two.driven, one.driven + two.driven
+        ways = one.driven, two.driven
+        lost = ways[0] + two.likely, one.likely + ways[1], ways[0] + ways[1]
+        wheels = float(np.log(PathPolicy.wheels))
         unknown = max(float(side.sum(axis=0).max()) for side in lost)
-        free = 1.5 * np.log(one.counted.sum() + two.counted.sum())
-        wheels = (
-            ("turned", turned, float(np.degrees(turns[~usual][np.argmax(large)]))),
-            ("turns", unknown, 0.0),
+        yield Explanation(unknown - null + wheels, _WHEELS, {"what": "turns", "value": 0.0})
+        yield from self._names(small, null)
+        if to_compare or null <= sound + wheels:
+            yield from self._other_paths(motions, usual, null)
+
+    def _other_paths(self, turns: Floats, usual: Bools, null: float) -> Iterator[Explanation]:
+        """Yield paths that go on after a turn (m, 3), mirrored or elsewhere; usual (m,) are the turns of the path as it is."""
+        usual_motion, small, any_turn = PathPolicy.usual_motion, turns[usual], turns[:: len(turns) // 12]
+        large = self.likely(turns[~usual])
+        turned = float(np.logaddexp.reduce(large)) - np.log(len(large))
+        free = 1.5 * np.log((self.before.counts + self.after.counts).sum())
+        for what, gain, value in (
+            ("turned", turned, float(np.degrees(turns[~usual, 2][np.argmax(large)]))),
             ("mirrored", self.refined(small, usual_motion, -1.0), 0.0),
             ("elsewhere", self.refined(any_turn, PathPolicy.stretch) - free, 0.0),
             ("mirrored", self.refined(any_turn, PathPolicy.stretch, -1.0) - free, 0.0),
-        )
-        for what, gain, value in wheels:
+        ):
             prior = float(np.log(PathPolicy.fault if what == "mirrored" else PathPolicy.wheels))
-            yield Explanation(gain - null + prior, "wheels-against-ranges", {"what": what, "value": value})
+            yield Explanation(gain - null + prior, _WHEELS, {"what": what, "value": value})
+
+    def _names(self, small: Floats, null: float) -> Iterator[Explanation]:
+        """Yield names that are exchanged, by motions (m, 3) of the path as it is, and ranges that are no distances."""
+        one, two, count = self.before, self.after, len(self.names)
         to, gain = self.exchanged(small)
         names = {self.names[k]: name for k, name in zip(to, self.names, strict=True)}
         changed = [name for k, name in zip(to, self.names, strict=True) if self.names[k] != name]
-        # The number of cycles of so many of the anchors.
-        gain -= gammaln(count + 1.0) - gammaln(count - len(changed) + 1.0) - np.log(max(len(changed), 1))
-        unordered = (one.nothing + two.likely.T, one.likely.T + two.nothing)
-        nowhere = max(float(side.sum(axis=1).max()) for side in unordered)
         prior, kind = float(np.log(PathPolicy.fault)) - null, "exchanged-names"
         if changed:
+            # The number of cycles of so many of the anchors.
+            gain -= math.lgamma(count + 1.0) - math.lgamma(count - len(changed) + 1.0) - math.log(len(changed))
             yield Explanation(gain + prior, kind, {"exchanged": True, "anchors": changed}, names=names)
+        unordered = (one.nothing + two.likely.T, one.likely.T + two.nothing)
+        nowhere = max(float(side.sum(axis=1).max()) for side in unordered)
         yield Explanation(nowhere + prior, kind, {"exchanged": False, "anchors": changed})
+
+
+_WHEELS = "wheels-against-ranges"
+"""What is told of a path that goes on elsewhere."""
+
+
+def _best_order(pairs: Floats) -> Ints:
+    """Return the order (a,) with the largest sum of values (a, a), one of each row and column."""
+    best = pairs.argmax(axis=1)
+    if len(np.unique(best)) == len(best):
+        return best
+    from scipy.optimize import linear_sum_assignment  # a twentieth of a second, which sound recordings do not need
+
+    return np.asarray(linear_sum_assignment(-pairs)[1], dtype=np.intp)
 
 
 def _best_place(paths: Floats, ranges: Floats, counted: Floats) -> Floats:
