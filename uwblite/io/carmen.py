@@ -6,17 +6,28 @@ ROBOTLASER1 exists with and without num_remissions and turn_axis, and some publi
 
 import hashlib
 import os
+import re
 from array import array
+from collections import defaultdict
 from collections.abc import Callable
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, Ints
 from ..errors import ConfigError, FormatError
 from ..sensor_log import Gyro, LogNotes, Odometry, SensorLog, UwbRanges, fault_of_id, odometry_in_bursts
-from .carmen_laser import Block, LaserMessages
+from .carmen_laser import LaserMessages
 from .carmen_stamps import LineClock, judged, time_order
-from .carmen_words import BrokenLine, Params, is_message_name, numbers, stamp_of, why_broken
+from .carmen_words import (
+    BrokenLine,
+    Params,
+    columns_of,
+    is_message_name,
+    numbers,
+    sound_columns,
+    stamp_of,
+    why_broken,
+)
 from .carmen_writer import write_log
 from .log_parts import parts_of
 from .readings import MOST_TAGS, ranges_of
@@ -35,6 +46,7 @@ _UNUSED = frozenset(
 _LIDARS = tuple(f"ROBOTLASER{number}" for number in range(1, 6))
 _NAMES_COUNTED = 100
 """Distinct names of foreign messages counted one by one."""
+_END_OF_NAME = re.compile(rb"[\x00-\x20]")
 _HOPELESS = 20_000
 """Broken lines after which reading stops early when nearly all lines are broken."""
 
@@ -48,7 +60,7 @@ def read_log(
 
     Parameters
     ----------
-    every_nth_scan : keep every n-th laser scan; the others are counted and never decoded.
+    every_nth_scan : keep every n-th laser scan; the others are counted and not kept.
     max_broken_share : share of the messages that may be broken (0..1); each is skipped and counted in the notes.
     scan_message : the messages whose scans are read, for example ROBOTLASER2 of a second lidar; empty = the first lidar's.
 
@@ -96,40 +108,74 @@ class LogReader:
         }
 
     def feed(self, block: bytes) -> None:
-        """Take a block of whole lines."""
-        lines = Block.of(block)
-        block, gaps = lines.text, lines.gaps
-        ends = gaps[lines.array[gaps] == 10]
-        starts = np.concatenate([[0], ends[:-1] + 1])
-        line_numbers, count = self.lines + 1 + np.arange(len(starts)), len(starts)
-        if len(written := np.flatnonzero(ends > starts)) < count:
-            starts, ends, line_numbers = starts[written], ends[written], line_numbers[written]
-        first_gap = np.searchsorted(gaps, starts)
-        name_ends = gaps[first_gap]
-        self.laser.begin(lines)
+        """Take a block of whole lines: those that are written as most are by kinds, the others one by one."""
+        lines, before = block.split(b"\n")[:-1], self.lines + 1
+        self.lines += len(lines)
         broken: list[tuple[int, str]] = []
-        rows = zip(line_numbers.tolist(), starts.tolist(), name_ends.tolist(), ends.tolist(), first_gap.tolist(), strict=True)
-        for number, start, name_end, end, gap in rows:
-            name, self.number = block[start:name_end], number
+        for k in self._take_kinds(lines, before):
+            line, self.number = lines[k], before + k
+            name = line[: _END_OF_NAME.search(line + b"\n").start()]  # type: ignore[union-attr]
             try:
                 handler = self.handlers.get(name)
                 if handler is not None:
-                    handler(block[start:end].split())
+                    handler(line.split())
                 elif name in self.laser.kinds:
-                    self.laser.take(self.laser.kinds[name], number, start, end, gap)
-                elif not self._unused(name, block, start, end):
+                    self.laser.take(self.laser.kinds[name], self.number, line.split())
+                elif not self._unused(name, line):
                     continue
             except (BrokenLine, ValueError) as error:
-                broken.append((number, why_broken(error)))
+                broken.append((self.number, why_broken(error)))
             self.messages += 1
-        self.lines += count
-        broken += [(number, why_broken(error)) for number, error in self.laser.decode()]
         self._count_broken(broken)
 
-    def _unused(self, name: bytes, block: bytes, start: int, end: int) -> bool:
+    def _take_kinds(self, lines: list[bytes], before: int) -> list[int]:
+        """Take the messages of a kind together where all of a block are sound and written alike; return which lines are left.
+
+        `before` is the number of the first line. Until it is known whether the log has ipc_timestamp, lines come one by one.
+        """
+        kinds = defaultdict[bytes, list[int]](list)
+        for k, line in enumerate(lines):
+            kinds[line[: line.find(b" ")]].append(k)
+        if not self.has_ipc and any(name in self.handlers for name in kinds):
+            return list(range(len(lines)))
+        left = list[int]()
+        alone = sum(name.startswith(b"UWB") for name in kinds) == 1, sum(name in self.laser.kinds for name in kinds) == 1
+        for name, rows in kinds.items():
+            own, numbers = [lines[k] for k in rows], np.array(rows) + before
+            if name == b"ODOM":
+                taken = self._take_odometry(own, numbers)
+            elif name == b"UWB":
+                taken = alone[0] and self._take_ranges(own, numbers)
+            else:
+                taken = name in self.laser.kinds and alone[1] and self.laser.take_alike(self.laser.kinds[name], own, numbers)
+            if taken:
+                self.messages += len(rows)
+            else:
+                left += rows
+        return sorted(left)
+
+    def _take_odometry(self, lines: list[bytes], numbers: Ints) -> bool:
+        words = columns_of(lines, 10)
+        values = None if words is None else sound_columns(words[7], words[1:4])
+        if values is None:
+            return False
+        self.odometry.frombytes(np.column_stack([values, numbers]).tobytes())
+        return True
+
+    def _take_ranges(self, lines: list[bytes], numbers: Ints) -> bool:
+        words = columns_of(lines, 7)
+        values = None if words is None else sound_columns(words[4], words[2:4])
+        if values is None or words is None or not self.uwb_ids.keys() >= set(words[1]):
+            return False
+        anchors = [self.uwb_ids[name] for name in words[1]]
+        rows = np.column_stack([values[:, 0], anchors, values[:, 1:], np.zeros(len(lines)), numbers])
+        self.uwb.frombytes(rows.tobytes())
+        return True
+
+    def _unused(self, name: bytes, line: bytes) -> bool:
         """Count a message that is not used; return False for blank lines and comments."""
         if not name:
-            name = block[start:end].strip().split(maxsplit=1)[0] if block[start:end].strip() else b""
+            name = line.strip().split(maxsplit=1)[0] if line.strip() else b""
             if name and not name.startswith(b"#"):
                 raise BrokenLine("begins with a blank")
         if not name or name.startswith(b"#"):
@@ -172,7 +218,7 @@ class LogReader:
             self.laser.ipc_left_out = True
         else:
             raise BrokenLine(f"{name} has {len(tokens)} fields, expected {fields + 3}")
-        return stamp_of(tokens[fields:])
+        return stamp_of(tokens[fields if len(tokens) == fields + 3 else fields + 1])
 
     def _count_broken(self, broken: list[tuple[int, str]]) -> None:
         broken.sort()

@@ -1,11 +1,8 @@
-"""The laser messages of a CARMEN log: found line by line, their readings decoded for a whole block of lines at a time."""
+"""The laser messages of a CARMEN log, read line by line or, where they are written alike, a whole block of lines at a time."""
 
 import math
-import re
 from array import array
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +11,20 @@ from .. import se2
 from ..arrays import Floats, Ints
 from ..sensor_log import LaserScans
 from .carmen_stamps import LineClock, time_order
-from .carmen_words import HEAD, RANK, BrokenLine, Layout, Params, kinds_of, numbers, parse_head, split_tail
+from .carmen_words import (
+    HEAD,
+    RANK,
+    BrokenLine,
+    Layout,
+    Params,
+    columns_of,
+    kinds_of,
+    numbers,
+    parse_head,
+    places_behind,
+    sound_columns,
+    stamp_of,
+)
 from .readings import DEFAULT_REACH, ScanGeometry, beams_lie_between, clean, resampled, resampling_warning
 
 DEFAULT_RANGE_MIN = 0.02
@@ -27,82 +37,26 @@ _URG_PERIOD = 0.1
 """s; time of one turn of a URG-04LX."""
 
 
-Bytes = NDArray[np.uint8]
-
-
-class Pending(NamedTuple):
-    """One message of the block at hand, parsed but for its readings."""
-
-    number: int
-    first: int
-    """Index into the gaps of the gap behind the first reading."""
-    stamp: float
-
-
-@dataclass(slots=True, eq=False)
-class Block:
-    """Some whole lines of a log."""
-
-    text: bytes
-    """The lines, each with its line end."""
-    array: Bytes
-    """The same."""
-    gaps: Ints
-    """Index of every blank, tab or line end in the text."""
-
-    @staticmethod
-    def of(text: bytes) -> "Block":
-        """Return the block of a text, its words parted by single blanks."""
-        if b"  " in text or b"\t" in text:
-            text = re.sub(rb"(?<=[^\n])[ \t]+", b" ", text)
-        array = np.frombuffer(text, dtype=np.uint8)
-        return Block(text, array, np.flatnonzero(array <= 32))
-
-    def decode_rows(self, beams: int, pending: list[Pending]) -> tuple[NDArray[np.float32], list[ValueError | None]]:
-        """Return the readings (k, beams) of messages, and by message what is wrong with it."""
-        errors: list[ValueError | None] = [None] * len(pending)
-        first = np.array([p.first for p in pending], dtype=np.intp)
-        begins, ends = self.gaps[np.maximum(first - 1, 0)] + 1, self.gaps[first + beams - 1]
-        values = np.empty((len(pending), beams), dtype=np.float32)
-        word = self.text[begins[0] : self.gaps[first[0]]]
-        width, decimals = len(word), len(word) - 1 - word.find(b".")
-        quick = (ends - begins == beams * (width + 1) - 1) & (1 <= decimals <= 6) & (decimals + 2 <= width <= 9)
-        if quick.any():
-            values[quick], quick[quick] = decode_equal_widths(self.array, begins[quick], beams, width, decimals)
-        for row in np.flatnonzero(~quick):
-            try:
-                readings = np.array(self.text[begins[row] : ends[row]].split(), dtype=np.float64)
-                if len(readings) != beams:
-                    raise BrokenLine("readings are parted unevenly")
-                values[row] = np.clip(readings, -1.0, 1e30)
-            except ValueError as error:
-                errors[row] = error
-        return values, errors
-
-
-def decode_equal_widths(
-    text: Bytes, begins: Ints, count: int, width: int, decimals: int
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def decode_equal_widths(text: bytes, count: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Decode rows of numbers that all have the same width, ``0.123 4.567 8.900``, by columns of digits: five times as fast.
 
     Parameters
     ----------
-    begins : (k,) index of each row's first character. count : numbers in a row.
-    width : characters of each number; one blank stands between numbers and behind the last.
-    decimals : digits behind the dot, 1..6.
+    text : the rows, one behind the other; one blank stands between numbers and behind the last.
+    count : numbers in a row. width : characters of each number.
 
     Returns
     -------
-    The numbers (k, count), and whether every number of the row has that form (k,); the values of other rows mean nothing.
+    The numbers (k, count), and whether every number of the row has the form of the first of all (k,); the values of other rows
+    mean nothing.
     """
-    span = count * (width + 1)
-    characters = np.empty((len(begins), count, width + 1), dtype=np.uint8)
-    for row, begin in zip(characters, begins.tolist(), strict=True):
-        row.reshape(-1)[:] = text[begin : begin + span]
-    characters ^= ord("0")
-    dot = width - decimals - 1
+    characters = np.frombuffer(text, dtype=np.uint8).reshape(-1, count, width + 1) ^ ord("0")
+    dot = text.find(b".", 0, width)
+    decimals = width - 1 - dot
+    if not (dot >= 1 and 1 <= decimals <= 6 and width <= 9):
+        return np.zeros(characters.shape[:2], dtype=np.float32), np.zeros(len(characters), dtype=bool)
     plain = (characters[:, :, dot] == ord(".") ^ ord("0")).all(axis=1)
-    plain &= (characters[:, :, width] ^ ord("0") <= ord(" ")).all(axis=1)
+    plain &= (characters[:, :, width] == ord(" ") ^ ord("0")).all(axis=1)
     total = np.zeros(characters.shape[:2], dtype=np.uint32)
     for column in (c for c in range(width) if c != dot):
         digit = characters[:, :, column]
@@ -122,11 +76,10 @@ class _Scans:
     numbers: "array[int]" = field(default_factory=lambda: array("q"))
     """Line of each scan: layouts take turns in one log."""
     seen: int = 0
-    pending: list[Pending] = field(default_factory=list)
 
 
 class LaserMessages:
-    """Collects the scans of one log; `begin` a block, `take` its lines, `decode` the block, `finish` the log."""
+    """Collects the scans of one log: `take` its lines, one by one or together, `finish` the log."""
 
     def __init__(self, every_nth_scan: int, message: str = "") -> None:
         self.kinds = kinds_of(message)
@@ -137,6 +90,8 @@ class LaserMessages:
         self._kind = b""
         self._counts = dict.fromkeys(RANK, 0)
         self._layouts: dict[bytes, Layout] = {}
+        self._head = b""
+        """Of the last message, up to its first reading."""
         self._scans: dict[Layout, _Scans] = {}
         self._between = set[Layout]()
         """Layouts whose beams lie between those of another one."""
@@ -144,61 +99,72 @@ class LaserMessages:
         """stamp, laser pose (3), robot pose (3) of every message that gives them."""
         self._pose_lines = array("q")
 
-    def begin(self, block: Block) -> None:
-        """Start a block of lines."""
-        self._block = block
-
-    def take(self, name: bytes, number: int, start: int, end: int, gap: int) -> None:
-        """Take line `number`, block[start:end], whose name ends at gaps[gap], as a message of kind `name`."""
+    def take(self, name: bytes, number: int, words: list[bytes]) -> None:
+        """Take the words of line `number` as a message of kind `name`."""
         self._counts[name] += 1
         if name != self._kind:
             if self._kind and RANK[name] < RANK[self._kind]:
                 return
             self._kind = name
             self._scans, self._poses, self._pose_lines, self._layouts = {}, array("d"), array("q"), {}
-        text, gaps, what, head = self._block.text, self._block.gaps, name.decode(), gap + HEAD[name] - 1
-        if head >= len(gaps) or gaps[head] > end:
-            raise BrokenLine(f"{what} has {len(text[start:end].split())} fields, far too few")
-        layout = self._layout(name, text[start : gaps[head]])
-        last = head + layout.beams
-        if last >= len(gaps) or gaps[last] >= end:
+        what, first = name.decode(), HEAD[name]
+        if len(words) < first:
+            raise BrokenLine(f"{what} has {len(words)} fields, far too few")
+        layout = self._layout(name, words[:first])
+        last = first + layout.beams
+        if len(words) <= last:
             raise BrokenLine(f"{what} announces {layout.beams} readings but the line is too short for them")
-        stamp = self._tail(name, number, text[gaps[last] + 1 : end].split())
-        self._queue(layout, Pending(number, head + 1, stamp))
-
-    def _queue(self, layout: Layout, pending: Pending) -> None:
-        scans = self._scans.get(layout) or self._scans.setdefault(layout, _Scans())
-        if scans.seen % self._every_nth == 0:
-            scans.pending.append(pending)
+        tail = words[last:]
+        poses, place = places_behind(name, tail, self.ipc_left_out)
+        stamp = stamp_of(tail[place])
+        if name != b"RAWLASER1":
+            self._poses.extend((stamp, *numbers(tail[poses : poses + 6], what, 6)))
+            self._pose_lines.append(number)
+        scans = self._scans.setdefault(layout, _Scans())
         scans.seen += 1
+        if (scans.seen - 1) % self._every_nth == 0:
+            readings = np.clip(np.array(words[first:last], dtype=np.float64), -1.0, 1e30)
+            scans.ranges.frombytes(readings.astype(np.float32).tobytes())
+            scans.stamps.append(stamp)
+            scans.numbers.append(number)
 
-    def _layout(self, name: bytes, head: bytes) -> Layout:
-        layout = self._layouts.get(head) or parse_head(name, head.split())
+    def _layout(self, name: bytes, words: list[bytes]) -> Layout:
+        self._head = b" ".join(words) + b" "
+        layout = self._layouts.get(self._head) or parse_head(name, words)
         if len(self._layouts) < _LAYOUTS_KEPT:
-            self._layouts[head] = layout
+            self._layouts[self._head] = layout
         return layout
 
-    def _tail(self, name: bytes, number: int, tail: list[bytes]) -> float:
-        """Read what follows the readings; remember the poses, return the stamp."""
-        poses, stamp = split_tail(name, tail, self.ipc_left_out)
+    def take_alike(self, name: bytes, lines: list[bytes], line_numbers: Ints) -> bool:
+        """Take messages of kind `name` that all begin as the last one did, with readings of one width, or none; say whether."""
+        layout, head = self._layouts.get(self._head), len(self._head)
+        if name != self._kind or layout is None or not all(line.startswith(self._head) for line in lines):
+            return False
+        width = lines[0].find(b" ", head) - head
+        end = head + layout.beams * (width + 1)
+        tails = columns_of([line[end:] for line in lines], len(lines[0][end:].split()))
+        if not tails or (name != b"FLASER" and len(set(tails[0])) > 1):
+            return False
+        try:
+            poses, place = places_behind(name, [column[0] for column in tails], self.ipc_left_out)
+        except BrokenLine:
+            return False
+        values = sound_columns(tails[place], tails[poses : poses + 6] if name != b"RAWLASER1" else ())
+        scans = self._scans.setdefault(layout, _Scans())
+        used = slice(-scans.seen % self._every_nth, None, self._every_nth)
+        # Scans that are not used as well: only a line of this form has its stamp there.
+        ranges, plain = decode_equal_widths(b"".join([line[head:end] for line in lines]), layout.beams, width)
+        if values is None or not plain.all():
+            return False
         if name != b"RAWLASER1":
-            self._poses.extend((stamp, *numbers(tail[poses : poses + 6], name.decode(), 6)))
-            self._pose_lines.append(number)
-        return stamp
-
-    def decode(self) -> Iterator[tuple[int, ValueError]]:
-        """Decode the readings of the block; yield (line number, error) of lines whose readings are broken."""
-        for layout, scans in self._scans.items():
-            if scans.pending:
-                pending, scans.pending = scans.pending, []
-                values, errors = self._block.decode_rows(layout.beams, pending)
-                keep = np.array([e is None for e in errors])
-                if keep.any():
-                    scans.ranges.frombytes(np.ascontiguousarray(values if keep.all() else values[keep]).data.cast("B"))
-                sound = [p for p, error in zip(pending, errors, strict=True) if error is None]
-                scans.stamps.extend(p.stamp for p in sound)
-                scans.numbers.extend(p.number for p in sound)
-                yield from ((p.number, e) for p, e in zip(pending, errors, strict=True) if e is not None)
+            self._poses.frombytes(values.tobytes())
+            self._pose_lines.extend(line_numbers.tolist())
+        self._counts[name] += len(lines)
+        scans.seen += len(lines)
+        scans.ranges.frombytes(ranges[used].tobytes())
+        scans.stamps.frombytes(values[used, 0].tobytes())
+        scans.numbers.extend(line_numbers[used].tolist())
+        return True
 
     def robot_poses(self) -> tuple[Floats, Ints]:
         """Return stamp and pose of the robot (k, 4) of every message that gives them, and its line (k,)."""

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,14 +28,30 @@ def numbers(tokens: list[bytes], what: str, count: int) -> list[float]:
     return values
 
 
-def stamp_of(tokens: list[bytes]) -> float:
-    """Return the time of a message, s, from `ipc_timestamp host logger_timestamp` or `host logger_timestamp`."""
-    stamp = float(tokens[0] if len(tokens) == 3 else tokens[1])
+def stamp_of(token: bytes) -> float:
+    """Return a stamp, s, that is a time."""
+    stamp = float(token)
     if not math.isfinite(stamp):
         raise BrokenLine("the stamp is not finite")
     if abs(stamp) > MOST_SECONDS:
         raise BrokenLine("the stamp is no time")
     return stamp
+
+
+def columns_of(lines: list[bytes], words: int) -> list[tuple[bytes, ...]] | None:
+    """Return the words of lines by their place in the line; None where a line has another number of words."""
+    rows = [line.split() for line in lines]
+    return list(zip(*rows, strict=True)) if {len(row) for row in rows} == {words} else None
+
+
+def sound_columns(stamps: Sequence[bytes], others: Sequence[Sequence[bytes]]) -> Floats | None:
+    """Return the numbers (n, 1 + c) of words in columns, stamps first; None where one is no number or beyond any."""
+    try:
+        values = np.array([list(map(float, column)) for column in (stamps, *others)])
+    except ValueError:
+        return None
+    sound = np.abs(values[0]).max() <= MOST_SECONDS and np.abs(values[1:]).max(initial=0.0) <= MOST_METRES
+    return np.ascontiguousarray(values.T) if sound else None
 
 
 def is_message_name(name: bytes) -> bool:
@@ -87,8 +104,6 @@ def kinds_of(message: str) -> dict[bytes, bytes]:
 def parse_head(name: bytes, tokens: list[bytes]) -> Layout:
     """Read the words before the readings."""
     what = name.decode()
-    if len(tokens) != HEAD[name]:
-        raise BrokenLine(f"{what}: fields are parted unevenly")
     beams = int(tokens[-1])
     if not 1 <= beams <= MAX_BEAMS:
         raise BrokenLine(f"{what} announces {beams} readings")
@@ -104,24 +119,25 @@ def parse_head(name: bytes, tokens: list[bytes]) -> Layout:
     return Layout(beams, angle_min, increment, range_max)
 
 
-def split_tail(name: bytes, tail: list[bytes], ipc_left_out: bool) -> tuple[int, float]:
-    """Return which word behind the readings the poses of laser and robot begin at (RAWLASER1 has none), and the stamp, s."""
+def places_behind(name: bytes, tail: Sequence[bytes], ipc_left_out: bool) -> tuple[int, int]:
+    """Return which of the words behind the readings the poses of laser and robot begin at (RAWLASER1 has none), and which is
+    the stamp."""
     if name == b"FLASER":
         if len(tail) not in (8, 9):
             raise BrokenLine(f"FLASER has {len(tail)} fields behind its readings, expected 9")
-        return 0, stamp_of(tail[6:])
-    rest = tail[1 + int(tail[0]) :] if tail and len(tail[0]) < 10 and tail[0].isdigit() else tail
+        return 0, 6 if len(tail) == 9 else 7
+    rest = len(tail) - 1 - int(tail[0]) if tail and len(tail[0]) < 10 and tail[0].isdigit() else len(tail)
     if name == b"RAWLASER1":
-        rest = rest if len(rest) in (2, 3) else tail
-        if len(rest) not in (2, 3):
+        rest = rest if rest in (2, 3) else len(tail)
+        if rest not in (2, 3):
             raise BrokenLine(f"RAWLASER1 has {len(tail)} fields behind its readings, expected 4 + remissions")
-        return len(tail) - len(rest), stamp_of(rest)
-    rest = rest if 12 <= len(rest) <= 14 else tail
-    if not 12 <= len(rest) <= 14:
+        return len(tail) - rest, len(tail) - (3 if rest == 3 else 1)
+    rest = rest if 12 <= rest <= 14 else len(tail)
+    if not 12 <= rest <= 14:
         raise BrokenLine(f"ROBOTLASER1 has {len(tail)} fields behind its readings, expected 15 + remissions")
     # 14 = with turn_axis and ipc_timestamp, 12 = with neither; 13 is one of them.
-    has_ipc = len(rest) == 14 or (len(rest) == 13 and not ipc_left_out)
-    return len(tail) - len(rest), stamp_of(rest[-3:] if has_ipc else rest[-2:])
+    has_ipc = rest == 14 or (rest == 13 and not ipc_left_out)
+    return len(tail) - rest, len(tail) - (3 if has_ipc else 1)
 
 
 _ANCHOR_HEIGHT = "uwb_anchor_height_"

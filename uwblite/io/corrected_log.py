@@ -12,7 +12,7 @@ from ..arrays import Floats
 from ..errors import FormatError
 from ..map_result import MapResult
 from ..sensor_log import SensorLog
-from .carmen_words import HEAD, split_tail
+from .carmen_words import HEAD, places_behind, stamp_of
 from .carmen_writer import scan_lines
 from .files import replacing
 from .log_parts import parts_of
@@ -118,8 +118,8 @@ def _poses_in(words: list[bytes], ipc_left_out: bool) -> tuple[int, float]:
     """Return the word at which the poses of a laser message begin, and its stamp, s."""
     name = words[0]
     behind = HEAD[name] + int(words[HEAD[name] - 1])
-    place, stamp = split_tail(name, words[behind:], ipc_left_out)
-    return behind + place, stamp
+    poses, stamp = places_behind(name, words[behind:], ipc_left_out)
+    return behind + poses, stamp_of(words[behind + stamp])
 
 
 _SAME_TIME = 0.5
