@@ -7,8 +7,6 @@ from typing import Any, ClassVar, Self, TypeVar, get_args, get_origin
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from .errors import DataError
 
@@ -131,6 +129,9 @@ def concatenated(parts: Sequence[_Joined]) -> _Joined:
 
 def connected(one: Ints, other: Ints, many: int) -> Ints:
     """Return the number (n,) of the part to which each of many nodes belongs, by ties (e,), (e,)."""
+    from scipy import sparse  # a sixth of a second, which readers of files do without
+    from scipy.sparse.csgraph import connected_components
+
     ties = sparse.coo_matrix((np.ones(len(one), dtype=np.int8), (one, other)), shape=(many, many))
     return np.asarray(connected_components(ties, directed=False)[1], dtype=np.intp)
 

@@ -7,16 +7,18 @@ findings are those of the recording as well.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import DataError
 from ..findings import DOUBT, NOTE, WARNING, WHEELS_AGAINST_LIDAR, Finding, of_severity, ranked
-from ..map_result import MapResult
 from ..screening.screen import screen
 from ..sensor_log import SensorLog
 from . import sensor_checks
 from .causes import explained
 from .facts import check_recording
+
+if TYPE_CHECKING:
+    from ..map_result import MapResult
 
 _BROKEN = 0.001
 """Share of broken lines from which on a disk, cable or writer is bad."""
@@ -45,7 +47,7 @@ class RecordingView:
     """As it was read."""
     repaired: SensorLog | None
     """Screened; None where the screening refuses it."""
-    result: MapResult | None
+    result: "MapResult | None"
     """The map that was made for the check, where one was."""
     refusal: str
     """Why no map can be made."""
@@ -54,7 +56,7 @@ class RecordingView:
 
 
 def diagnose(
-    log: SensorLog, *, result: MapResult | None = None, refused: str = "", repaired: SensorLog | None = None
+    log: SensorLog, *, result: "MapResult | None" = None, refused: str = "", repaired: SensorLog | None = None
 ) -> Diagnosis:
     """Examine a recording.
 

@@ -8,23 +8,25 @@ import numpy as np
 
 from ..config import merge, override, parse_toml
 from ..errors import ConfigError, UsageError
-from ..grid.occupancy_grid import OccupancyGrid
 from ..io.bag_topics import BagTopics
 from ..io.folders import refuse_foreign_picture
 from ..io.formats import read_recording, refuse_existing
 from ..io.log_parts import each_once
 from ..io.source import read_settings
-from ..io.stored_result import StoredAnchor, read_space
 from ..io.uwb_mapping import UwbMapping, parse_mappings
 from ..sensor_log import SensorLog, SensorMounting
 from . import console
 
 if TYPE_CHECKING:
+    from ..grid.occupancy_grid import OccupancyGrid
+    from ..io.stored_result import StoredAnchor
     from ..pipeline.mapping_config import MappingConfig
 
 
-def begin_plan(args: argparse.Namespace, head: str) -> tuple[str, str, OccupancyGrid, tuple[StoredAnchor, ...]]:
+def begin_plan(args: argparse.Namespace, head: str) -> "tuple[str, str, OccupancyGrid, tuple[StoredAnchor, ...]]":
     """Return the names of a plan's table, which begins so, and of its picture, which may be written, and the map it is for."""
+    from ..io.stored_result import read_space  # what reads recordings does without maps
+
     table, picture = f"{args.out}.csv", f"{args.out}.png"
     refuse_existing(args.force, table, picture)
     refuse_foreign_picture(table, picture, head)

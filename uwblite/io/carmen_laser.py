@@ -50,20 +50,25 @@ def decode_equal_widths(text: bytes, count: int, width: int) -> tuple[NDArray[np
     The numbers (k, count), and whether every number of the row has the form of the first of all (k,); the values of other rows
     mean nothing.
     """
-    characters = np.frombuffer(text, dtype=np.uint8).reshape(-1, count, width + 1) ^ ord("0")
     dot = text.find(b".", 0, width)
     decimals = width - 1 - dot
     if not (dot >= 1 and 1 <= decimals <= 6 and width <= 9):
-        return np.zeros(characters.shape[:2], dtype=np.float32), np.zeros(len(characters), dtype=bool)
-    plain = (characters[:, :, dot] == ord(".") ^ ord("0")).all(axis=1)
-    plain &= (characters[:, :, width] == ord(" ") ^ ord("0")).all(axis=1)
-    total = np.zeros(characters.shape[:2], dtype=np.uint32)
+        rows = len(text) // (count * (width + 1))
+        return np.zeros((rows, count), dtype=np.float32), np.zeros(rows, dtype=bool)
+    form = np.full(width + 1, ord("0"), dtype=np.uint8)
+    form[[dot, width]] = ord("."), ord(" ")
+    most = np.full(width + 1, 9, dtype=np.uint8)
+    most[[dot, width]] = 0
+    digits = np.frombuffer(text, dtype=np.uint8).reshape(-1, count * (width + 1)) - np.tile(form, count)
+    plain = np.all(digits <= np.tile(most, count), axis=1)
+    digits = digits.reshape(-1, count, width + 1)
+    # Four digits fit into 16 bits, and seven exactly into a float of single precision, whose quotient is then the nearest one.
+    total = np.zeros(digits.shape[:2], dtype=np.uint16 if width <= 5 else np.uint32)
     for column in (c for c in range(width) if c != dot):
-        digit = characters[:, :, column]
-        plain &= digit.max(axis=1) <= 9
         total *= 10
-        total += digit
-    return (total / 10.0**decimals).astype(np.float32), plain
+        total += digits[:, :, column]
+    quotient = np.divide(total, 10.0**decimals, dtype=np.float32 if width <= 8 else np.float64)
+    return quotient.astype(np.float32, copy=False), plain
 
 
 @dataclass(slots=True, eq=False)

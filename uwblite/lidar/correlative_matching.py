@@ -16,7 +16,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy import fft
 
 from .. import se2
 from ..arrays import TINY, Floats, Ints
@@ -83,6 +82,8 @@ def score_grid(
     target: Clouds, source: Clouds, T_target_source: Floats, window: Window, config: CorrelativeConfig
 ) -> tuple[Singles, Floats, Ints, Ints]:
     """Return the scores (h, r, c) of a grid by heading, y and x, headings (h,), rad, and shifts in x (c,) and y (r,), cells."""
+    from scipy import fft  # most recordings that are only checked need no search
+
     steps = np.array([config.resolution, config.resolution, config.angle_step])
     wide, tall, turns = np.ceil(np.array(window) / steps - TINY).astype(np.intp).tolist()
     headings = T_target_source[2] + np.arange(-turns, turns + 1) * config.angle_step

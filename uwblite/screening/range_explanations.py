@@ -217,9 +217,11 @@ def _on_stretch(log: SensorLog, traces: Sequence[Trace], offsets: Floats, longes
     """
     likely = np.zeros((len(PathPolicy.noise), len(PathPolicy.factors) + len(offsets)))
     lost = np.zeros((len(likely), 1))
+    stamps, poses = log.odometry.stamps, log.odometry.poses
     for trace in traces:
-        shifted = log.odometry.at(trace.stamps + offsets[:, None])[..., :2]
-        paths = np.concatenate([PathPolicy.factors[:, None, None] * trace.places, shifted])
+        shifted = trace.stamps + offsets[:, None]
+        places = np.stack([np.interp(shifted, stamps, poses[:, k]) for k in (0, 1)], axis=-1)
+        paths = np.concatenate([PathPolicy.factors[:, None, None] * trace.places, places])
         likely += _best_place(paths, trace.ranges, np.ones(len(trace.ranges)))
         lost += _by_way(trace, longest)[:, None]
     of_any = np.logaddexp.reduce(likely, axis=1, keepdims=True) - np.log(likely.shape[1])
@@ -341,12 +343,16 @@ class Moment:
         return most
 
     def exchanged(self, motions: Floats) -> tuple[Ints, float]:
-        """Return which anchor each is after the moment (a,) if the path goes on by some motion (m, 3), and its log likelihood;
-        that of anchors which keep their names is no matter, and not refined."""
+        """Return which anchor each is after the moment (a,) if the path goes on by some motion (m, 3), and its log likelihood.
+
+        They keep their names where others are likelier by less than the prior odds deny.
+        """
         each = np.arange(len(self.names))
         k, other = np.indices((len(each), len(each))).reshape(2, -1)
         pairs = self.same(k, other, motions).max(axis=0).reshape(len(each), len(each), len(motions))
         most, names, best, bound = -np.inf, each, 0, pairs.max(axis=1).sum(axis=0)
+        if bound.max() + np.log(PathPolicy.fault) < (kept := float(pairs[each, each].sum(axis=0).max())):
+            return each, kept
         for m in np.argsort(-bound).tolist():
             if bound[m] > most:
                 order = _best_order(pairs[:, :, m])
