@@ -350,16 +350,16 @@ class Moment:
         each = np.arange(len(self.names))
         k, other = np.indices((len(each), len(each))).reshape(2, -1)
         pairs = self.same(k, other, motions).max(axis=0).reshape(len(each), len(each), len(motions))
-        most, names, best, bound = -np.inf, each, 0, pairs.max(axis=1).sum(axis=0)
-        if bound.max() + np.log(PathPolicy.fault) < (kept := float(pairs[each, each].sum(axis=0).max())):
-            return each, kept
+        names, best, bound = each, 0, np.minimum(pairs.max(axis=0).sum(axis=0), pairs.max(axis=1).sum(axis=0))
+        kept = float(pairs[each, each].sum(axis=0).max())
+        least = kept - float(np.log(PathPolicy.fault))
         for m in np.argsort(-bound).tolist():
-            if bound[m] > most:
+            if bound[m] > least:
                 order = _best_order(pairs[:, :, m])
-                if (gain := float(pairs[each, order, m].sum())) > most:
-                    most, names, best = gain, order, m
+                if (gain := float(pairs[each, order, m].sum())) > least:
+                    least, names, best = gain, order, m
         if np.array_equal(names, each):
-            return each, most
+            return each, kept
         return names, self.refined(motions[best : best + 1], PathPolicy.usual_motion, names=names)
 
     def rows(self, to_compare: bool = False) -> Iterator[Explanation]:
@@ -424,7 +424,7 @@ def _best_order(pairs: Floats) -> Ints:
     best = pairs.argmax(axis=1)
     if len(np.unique(best)) == len(best):
         return best
-    from scipy.optimize import linear_sum_assignment  # a twentieth of a second, which sound recordings do not need
+    from scipy.optimize import linear_sum_assignment  # a twentieth of a second, which few recordings need
 
     return np.asarray(linear_sum_assignment(-pairs)[1], dtype=np.intp)
 
