@@ -15,7 +15,7 @@ from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import Clouds
 from uwblite.lidar.object_likelihood import ObjectLikelihood
-from uwblite.lidar.registration import Prior, register
+from uwblite.lidar.registration import Gaussian, Placed, Placement, Prior, RegistrationConfig, register
 from uwblite.lidar.scan_matching import PairPolicy, align_pairs, pairs_of
 
 Floats = NDArray[np.float64]
@@ -72,10 +72,33 @@ def placements(clouds: Clouds, truth: Floats, apart: int, rng: np.random.Generat
     objects = objects.learnt(pairs, ended)
     wide = np.broadcast_to(SLIPPED, mean.shape)
     prior = Prior.about(mean, sound, wide, wide)
-    placed, covariance, probability = register(objects, pairs, prior, ended).posterior(SLIPS)
+    placed, spread, probability = likelier_places(register(objects, pairs, prior, ended), SLIPS)
     off = se2.between(step, placed.pose)
-    squared = np.einsum("ei,ei->e", off, np.linalg.solve(covariance + error**2 * np.eye(3), off[:, :, None])[:, :, 0])
+    squared = np.einsum("ei,ei->e", off, np.linalg.solve(spread + error**2 * np.eye(3), off[:, :, None])[:, :, 0])
     return Placements(probability[placed.shown], squared[placed.shown] < CHI2, int(np.sum(~placed.shown)))
+
+
+def likelier_places(found: Placement, slips: float) -> tuple[Placed, Floats, Floats]:
+    """Return the likelier place (e) of each pair, sound or slipped with a probability beforehand, its covariance (e, 3, 3) and
+    probability (e,)."""
+    prior, useless = found.prior, RegistrationConfig.useless
+    (sound, usual), (slipped, wide) = (found.likeliest(part) for part in (prior.sound, prior.slipped))
+    of_sound, of_slip = np.log1p(-slips) + usual, np.log(slips) + wide
+    every = np.logaddexp(np.logaddexp(of_sound, of_slip), np.log(useless / (1.0 - useless)))
+    narrow, broad = covariance(sound, prior.sound), covariance(slipped, prior.slipped)
+    off, slid = slipped.pose - sound.pose, of_slip > of_sound
+    off[:, 2] = se2.wrap_angle(off[:, 2])
+    spread = np.linalg.solve(narrow, broad + off[:, :, None] * off[:, None, :])
+    same = np.einsum("eii->e", spread) < RegistrationConfig.contradicts
+    likely = np.where(same, np.logaddexp(of_sound, of_slip), np.maximum(of_sound, of_slip)) - every
+    place = sound.replaced(np.arange(len(same)), slipped, slid)
+    # Any of them may be favoured falsely, however much.
+    return place, np.where(slid[:, None, None], broad, narrow), (1.0 - useless) * np.exp(likely)
+
+
+def covariance(placed: Placed, prior: Gaussian) -> Floats:
+    """Return the covariance (e, 3, 3) of the poses by matches and prior."""
+    return np.linalg.inv(placed.information + np.linalg.inv(prior.covariance))
 
 
 def report(rows: list[tuple[str, Placements]]) -> str:

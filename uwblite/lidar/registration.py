@@ -89,10 +89,6 @@ class Placed(Aligned):
         """(e,) whether so many points match that a pose follows, and it is likelier than in space that nobody has seen."""
         return np.asarray((self.factors.matched >= RegistrationConfig.fewest) & (self.likelihood > 0.0))
 
-    def covariance(self, prior: Gaussian) -> Floats:
-        """Return the covariance (e, 3, 3) of the poses by matches and prior."""
-        return np.asarray(np.linalg.inv(self.information + np.linalg.inv(prior.covariance)), dtype=np.float64)
-
     def log_prior(self, prior: Gaussian) -> Floats:
         """Return the log of a prior's density (e,), summed over the poses that the matches leave open."""
         off = _difference(self.pose, prior.mean)
@@ -177,22 +173,6 @@ class Placement:
         motions.vector[rows] = sigma * np.einsum("eij,ej->ei", hessian, _difference(slipped.pose, part.mean))
         motions.matrix[rows] = sigma[:, :, None] * slipped.information * sigma[:, None, :]
         return motions
-
-    def posterior(self, slips: float) -> tuple[Placed, Floats, Floats]:
-        """Return the likelier place (e) of each pair, sound or slipped with a probability beforehand, its covariance (e, 3, 3)
-        and probability (e,)."""
-        useless = RegistrationConfig.useless
-        (sound, usual), (slipped, wide) = (self.likeliest(part) for part in (self.prior.sound, self.prior.slipped))
-        of_sound, of_slip = np.log1p(-slips) + usual, np.log(slips) + wide
-        every = np.logaddexp(np.logaddexp(of_sound, of_slip), np.log(useless / (1.0 - useless)))
-        narrow, broad = sound.covariance(self.prior.sound), slipped.covariance(self.prior.slipped)
-        off, slid = _difference(slipped.pose, sound.pose), of_slip > of_sound
-        spread = np.linalg.solve(narrow, broad + off[:, :, None] * off[:, None, :])
-        same = np.einsum("eii->e", spread) < RegistrationConfig.contradicts
-        likely = np.where(same, np.logaddexp(of_sound, of_slip), np.maximum(of_sound, of_slip)) - every
-        place = sound.replaced(np.arange(len(same)), slipped, slid)
-        # Any of them may be favoured falsely, however much.
-        return place, np.where(slid[:, None, None], broad, narrow), (1.0 - useless) * np.exp(likely)
 
 
 def register(objects: ObjectLikelihood, pairs: CloudPairs, prior: Prior, other: Floats) -> Placement:
