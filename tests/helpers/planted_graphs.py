@@ -80,6 +80,11 @@ def plain_ranges(pose, anchor, ranges, sigma):
     )
 
 
+def expected_ranges(edges, graph):
+    """Return the ranges (m,) that a graph expects, m, their known delays aside."""
+    return edges.residuals(graph)[:, 0] * edges.sigma + edges.corrected
+
+
 def relative_edges(truth, i, j, sigma, rng=None):
     """Return measurements of pose j in pose i with Gaussian noise (none without rng)."""
     i, j, sigma = np.asarray(i), np.asarray(j), np.asarray(sigma, dtype=float)

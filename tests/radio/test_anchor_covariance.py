@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.planted_graphs import expected_ranges
 
 from uwblite import se2
 from uwblite.graph.calibration import BIAS, CalibrationConfig, block, prior_edges, range_indices, unknowns, with_free
@@ -42,7 +43,7 @@ def known_world(count=COUNT):
         np.zeros((2 * count, 2)), np.zeros(2), still, range_indices(calibration, anchor, ids),
         weights=np.where(np.tile(poses[:, 0] > 6.0, 2), 0.02, 0.2),
     )  # fmt: skip
-    return graph.with_edges(prior_edges(listed)), replace(edges, ranges=edges.distances(graph))
+    return graph.with_edges(prior_edges(listed)), replace(edges, ranges=expected_ranges(edges, graph))
 
 
 def alike(offsets):
@@ -56,7 +57,7 @@ def alike(offsets):
 def system(graph, edges, anchor):
     """Return J (m, 3) by place and bias, in m, W (m,) and the prior information (3, 3) of one anchor's ranges."""
     own = edges.rows(edges.anchor == anchor)
-    towards = (graph.anchors[anchor] - graph.poses[own.pose, :2]) / own.distances(graph)[:, None]
+    towards = (graph.anchors[anchor] - graph.poses[own.pose, :2]) / expected_ranges(own, graph)[:, None]
     return np.column_stack([towards, np.ones(len(own))]), edge_weights(own, graph) / own.sigma**2, np.diag([0.0, 0.0, 25.0])
 
 
@@ -116,7 +117,7 @@ def test_few_ranges_and_open_directions_change_nothing():
     few = edges.rows(np.arange(29))
     np.testing.assert_array_equal(anchors_with_correlated_errors(graph.with_edges(few), few, WHOLE, CONFIG), WHOLE)
     standing = replace(edges, pose=np.zeros_like(edges.pose))
-    standing = replace(standing, ranges=standing.distances(graph))
+    standing = replace(standing, ranges=expected_ranges(standing, graph))
     np.testing.assert_array_equal(anchors_with_correlated_errors(graph.with_edges(standing), standing, WHOLE, CONFIG), WHOLE)
 
 
@@ -165,7 +166,7 @@ def driven_world(size, seed, scale=1.0):
     own = (alike(offsets) - (1.0 - _STEADY) * np.eye(len(pose))) * (anchor[:, None] == anchor)
     correlation = 0.5 * own + 0.5 * _STEADY * by_distance + (1.0 - _STEADY) * np.eye(len(pose))
     errors = size * np.linalg.cholesky(correlation) @ rng.standard_normal(len(pose))
-    edges = replace(edges, ranges=edges.distances(graph) + errors)
+    edges = replace(edges, ranges=expected_ranges(edges, graph) + errors)
     return optimize(graph.with_edges(prior_edges(listed), steps, edges))[0], correlation
 
 

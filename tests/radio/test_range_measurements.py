@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.planted import ranges, wander
+from helpers.planted_graphs import expected_ranges
 
 from uwblite import se2
 from uwblite.graph.graph import Calibration, Graph
@@ -36,7 +37,7 @@ def test_range_edges_measure_the_slant_distance_of_tag_and_anchor():
     tag = se2.transform(se2.interpolate_trajectory(stamps, truth, radio.stamps), MOUNTING.tag_position[:2])
     np.testing.assert_allclose(edges.tag_positions(truth[frames.index]), tag, atol=1e-9)
     expected = np.hypot(np.hypot(*(tag - places[radio.anchor]).T), height)
-    np.testing.assert_allclose(edges.distances(Graph(truth[frames.index], places)), expected, atol=1e-9)
+    np.testing.assert_allclose(expected_ranges(edges, Graph(truth[frames.index], places)), expected, atol=1e-9)
     np.testing.assert_array_equal(edges.sigma, 0.3)
     np.testing.assert_array_equal(edges.stamps, radio.stamps)
 
@@ -60,7 +61,7 @@ def test_each_anchor_gets_the_noise_of_its_own(outliers):
     noise = np.array([0.05, 0.25])[edges.anchor] * rng.standard_normal(len(edges))
     noise += np.where(rng.random(len(edges)) < outliers, rng.uniform(2, 6, len(edges)), 0.0)
     graph = Graph(truth[frames.index], places)
-    noisy = replace(edges, ranges=edges.distances(graph) + noise)
+    noisy = replace(edges, ranges=expected_ranges(edges, graph) + noise)
     learnt, noises = learn_noise(noisy, graph, 2, RangeNoiseConfig())
     # 30 % outliers shift the quartiles: 1.4826 MAD grows by up to a factor 1.7, and those beyond thrice that are left out.
     assert [n.sigma for n in noises] == [pytest.approx(s, rel=0.12 + outliers) for s in (0.05, 0.25)]
@@ -101,9 +102,9 @@ def test_late_ranges_pull_less_than_early_ones():
     _, truth, frames, places, _, edges = world(9, 150.0, 1, sigma=0.0, rate=4.0)
     rng, graph = np.random.default_rng(7), Graph(truth[frames.index], places)
     late = np.where(rng.random(len(edges)) < 0.3, rng.exponential(0.6, len(edges)), 0.0)
-    noisy = replace(edges, ranges=edges.distances(graph) + 0.05 * rng.standard_normal(len(edges)) + late)
+    noisy = replace(edges, ranges=expected_ranges(edges, graph) + 0.05 * rng.standard_normal(len(edges)) + late)
     learnt, _ = learn_noise(noisy, graph, 1, RangeNoiseConfig())
-    off = noisy.ranges - edges.distances(graph)
+    off = noisy.ranges - expected_ranges(edges, graph)
     mean = learnt.weights @ off / learnt.weights.sum()
     assert abs(mean) < 0.03 < np.median(off) + 0.01 < np.mean(off)
     # What is late by two or three sigmas is in part a delay; what is early by as much is noise.
@@ -120,7 +121,7 @@ def test_ranges_of_weight_zero_teach_no_noise():
     edges = replace(edges, height=np.zeros(len(edges)))
     graph = Graph(truth[frames.index], places)
     wrong = places + np.array([[2.0, -1.0], [0.0, 0.0]])
-    agreeing = replace(edges, ranges=edges.distances(graph.updated(graph.poses, wrong, np.zeros(0))))
+    agreeing = replace(edges, ranges=expected_ranges(edges, graph.updated(graph.poses, wrong, np.zeros(0))))
     off = np.arange(len(edges)) % 4 != 0
     mixed = replace(edges, ranges=np.where(off, agreeing.ranges, edges.ranges), weights=np.where(off, 0.0, 1.0))
     learnt, noises = learn_noise(mixed, graph, 2, RangeNoiseConfig())
@@ -151,7 +152,7 @@ def test_ranges_through_something_weigh_together_as_one_draw_of_their_delay():
     rng, graph = np.random.default_rng(8), Graph(truth[frames.index], places)
     through = edges.tag_positions(graph.poses)[:, 0] > 0.0
     late = np.where(through, 0.4, 0.0)
-    noisy = replace(edges, ranges=edges.distances(graph) + 0.05 * rng.standard_normal(len(edges)) + late)
+    noisy = replace(edges, ranges=expected_ranges(edges, graph) + 0.05 * rng.standard_normal(len(edges)) + late)
     learnt, (noise,) = learn_noise(noisy, graph, 1, RangeNoiseConfig(), steady=True, blocked=through)
     information = learnt.weights / learnt.sigma**2
     assert 0.3 < through.mean() < 0.7
@@ -174,7 +175,7 @@ def test_noise_is_learnt_from_clear_ranges_where_there_are_thirty(clear, least, 
     blocked = np.ones(len(edges), dtype=bool)
     blocked[np.linspace(0, len(edges) - 1, clear).astype(int)] = False
     error = np.where(blocked, rng.normal(0.0, 1.0, len(edges)), rng.normal(0.0, 0.06, len(edges)))
-    noisy = replace(edges, ranges=edges.distances(graph) + error)
+    noisy = replace(edges, ranges=expected_ranges(edges, graph) + error)
     _, (noise,) = learn_noise(noisy, graph, 1, RangeNoiseConfig(), blocked=blocked)
     assert least < noise.sigma < most
 
@@ -184,7 +185,7 @@ def test_densities_of_ranges_are_normalised_and_counted_once_where_errors_last()
     config = RangeNoiseConfig()
     _, truth, frames, places, _, edges = world(1, metres=150.0, sigma=0.0)
     graph = Graph(truth[frames.index], places)
-    edges = replace(edges, ranges=edges.distances(graph) + 0.1 * np.random.default_rng(6).standard_normal(len(edges)))
+    edges = replace(edges, ranges=expected_ranges(edges, graph) + 0.1 * np.random.default_rng(6).standard_normal(len(edges)))
     learnt = learn_noise(edges, graph, 3, config)[0]
     density, share = log_densities(learnt, graph, config.min_sigma)
     assert density.mean() == pytest.approx(-np.log(0.1) - 0.5 * np.log(2.0 * np.pi * np.e), abs=0.1)

@@ -98,16 +98,12 @@ class RangeEdges(Edges):
         c, s = se2.cos_sin(graph.poses[:, 2])
         return c.take(self.pose), s.take(self.pose)
 
-    def distances(self, graph: Graph) -> Floats:
-        """Return the expected slant distances (e,), m, before scale and bias."""
-        _, _, reach, cal = self._geometry(graph)
-        return _slant(reach, cal)
-
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by pose, anchor and the calibration that is free."""
         arm, offset, reach, cal = self._geometry(graph)
-        distance, scale = _slant(reach, cal), (1.0 + cal[0]) / self.sigma
-        direction = offset * (scale * np.where(cal[2] < 0.0, 2.0 / reach[0] - 1.0 / reach[1], 1.0 / reach[1]))
+        below, scale = cal[2] < 0.0, (1.0 + cal[0]) / self.sigma
+        distance = np.where(below, 2.0 * reach[0] - reach[1], reach[1])
+        direction = offset * (scale * np.where(below, 2.0 / reach[0] - 1.0 / reach[1], 1.0 / reach[1]))
         by_theta = direction[1] * arm[0] - direction[0] * arm[1]
         by_pose = np.stack([direction[0], direction[1], by_theta])[None].transpose(2, 0, 1)
         blocks: list[Block] = [("poses", self.pose, by_pose), ("anchors", self.anchor, -direction[None].transpose(2, 0, 1))]
@@ -124,8 +120,3 @@ class RangeEdges(Edges):
         c, s = self._heading(graph)
         ct, st = se2.cos_sin(graph.poses[self.pose, 2] + self.turn)
         return ct * x + st * y, ct * y - st * x, (c * x + s * y) * vx + (c * y - s * x) * vy
-
-
-def _slant(reach: Floats, calibration: Floats) -> Floats:
-    """Return the slant distances (e,) from P and sqrt(P^2 + |q|) (2, e) and the calibration (6, e)."""
-    return np.where(calibration[2] < 0.0, 2.0 * reach[0] - reach[1], reach[1])
