@@ -14,10 +14,10 @@ from uwblite.screening.wheel_motion import (
     _span,
     compare,
     disagreeing,
-    factor,
+    lidar_by_wheels,
     replaced,
     standing,
-    undiluted,
+    times_as_large,
     unmatched,
 )
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog
@@ -289,9 +289,9 @@ def test_the_factor_is_the_median_of_those_along_the_wheels_of_clear_motions():
     clear = np.flatnonzero(np.hypot(*wheels.T) > 0.08)
     # The factor by which the wheels' motion comes nearest to the lidar's.
     nearest = [np.linalg.lstsq(wheels[k, :, None], lidar[k], rcond=None)[0][0] for k in clear]
-    assert factor(wheels, lidar, 0.08) == pytest.approx(np.median(nearest))
-    assert factor(wheels[clear][:12], lidar[clear][:12], 0.0) == pytest.approx(np.median(nearest[:12]))
-    assert np.isnan(factor(wheels[:11], lidar[:11], 0.0))
+    assert times_as_large(lidar, wheels, 0.08) == pytest.approx(np.median(nearest))
+    assert times_as_large(lidar[clear][:12], wheels[clear][:12], 0.0) == pytest.approx(np.median(nearest[:12]))
+    assert np.isnan(times_as_large(lidar[:11], wheels[:11], 0.0))
 
 
 def test_noise_of_turns_that_are_chosen_by_it_makes_no_factor():
@@ -300,9 +300,9 @@ def test_noise_of_turns_that_are_chosen_by_it_makes_no_factor():
     wheels, lidar = rng.normal(0.0, 0.012, (4000, 1)), rng.normal(0.0, 0.001, (4000, 1))
     true = 0.5 * (np.arange(4000) % 100 == 0)[:, None]
     wheels, lidar = wheels + true, lidar + true
-    assert factor(wheels, lidar, 0.03) < 0.2
-    assert abs(undiluted(wheels, lidar, 0.03, 1.0) - 1.0) < 0.02
-    assert undiluted(wheels[:5], lidar[:5], 0.0, 7.0) == 7.0
+    assert times_as_large(lidar, wheels, 0.03) < 0.2
+    assert abs(lidar_by_wheels(wheels, lidar, 0.03, 1.0) - 1.0) < 0.02
+    assert lidar_by_wheels(wheels[:5], lidar[:5], 0.0, 7.0) == 7.0
 
 
 STILL = (20.0, 30.0)

@@ -53,9 +53,9 @@ def check_other_side(estimate: Estimate, task: Task) -> Iterator[Finding]:
     graph, other = estimate.graph, estimate.other_side
     if task.recordings.have_scans or len(task.recordings) > 1:
         return
-    known = other is not None and other.poses.shape == graph.poses.shape and other.anchors.shape == graph.anchors.shape
-    further = graph.with_estimates_of(other) if other is not None and known else None
-    for there in sides(graph, estimate.placed, task.config.solver, further):
+    alike = other is not None and other.poses.shape == graph.poses.shape and other.anchors.shape == graph.anchors.shape
+    start = graph.with_estimates_of(other) if other is not None and alike else None
+    for there in sides(graph, estimate.placed, task.config.solver, start):
         off = apart(there.graph, graph)
         if there.open and off > RangePolicy.elsewhere:
             text = (

@@ -234,11 +234,12 @@ class ScanEdges(Edges):
         row = np.zeros(len(graph.poses), dtype=np.intp)
         row[poses] = np.arange(len(poses))
         if len(poses) > len(row) and np.array_equal(twist[row].take(poses, axis=0), twist):
-            sensor, heading = self._moved(graph, graph.poses, twist[row])
+            sensor, heading = self._at_their_time(graph, graph.poses, twist[row])
             return sensor.take(poses, axis=0), (heading[0].take(poses), heading[1].take(poses))
-        return self._moved(graph, graph.poses[poses], twist)
+        return self._at_their_time(graph, graph.poses[poses], twist)
 
-    def _moved(self, graph: Graph, base: Floats, twist: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
+    def _at_their_time(self, graph: Graph, base: Floats, twist: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
+        """Return the same by the poses (e, 3) of the base and its velocities (e, 3) at the nominal times of the clouds."""
         if not np.any(self.calibration >= 0):
             return base, se2.cos_sin(base[:, 2])
         x, y, turn, delay = np.append(graph.calibration.values, 0.0)[self.calibration]

@@ -65,6 +65,7 @@ def cut(number: Ints, poses: Floats, size: int, linked: Bools) -> Pieces:
     linked : (k - 1,) which poses share an edge with the next one.
     """
     piece_size, motions = SchwarzPolicy.piece, number.shape[1]
+    # Chains that are shorter than a piece, more than a few of them, are none.
     if np.count_nonzero(~linked) * piece_size > max(len(linked), piece_size**2):
         linked = np.ones_like(linked)
     each = np.arange(len(number))

@@ -153,7 +153,7 @@ def around_columns(rays: SurfaceRays, poses: Floats, columns: Floats) -> Surface
 
 
 def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) -> SurfaceRays:
-    """Return the rays from poses (k, 3) that end on columns (c, 3), which are surfaces from a first number on."""
+    """Return the rays from poses (k, 3) that end on columns (c, 3), numbered as surfaces that begin with `first`."""
     if not len(columns):
         return rays.rows(slice(0))
     c, (at, direction) = ColumnPolicy, rays.in_map(poses)

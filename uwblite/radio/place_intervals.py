@@ -63,16 +63,16 @@ class _Search:
         part = self._best_split(own, best)
         if part is None:
             return
-        left, moment, places = part
+        leaves, arrives, places = part
         place, here = best.place.copy(), int(best.place[own[0]])
-        place[own[left:moment]], place[own[moment:]] = -1, len(best.found)
+        place[own[leaves:arrives]], place[own[arrives:]] = -1, len(best.found)
         found = [*best.found, places[1]]
         if np.array_equal(np.flatnonzero(best.place == here), own):
             found[here] = places[0]
         shares = self.model.worth(place)
         moved = self._numbered(place, found, best.height, shares)
         rivals = (self.model.with_places(each, shares).evidence for each in (best, other)[: 1 if other is best else 2])
-        if moved.evidence > max(rivals) and moved.evidence > self._blocked(best, own, moment, places, shares):
+        if moved.evidence > max(rivals) and moved.evidence > self._blocked(best, own, arrives, places, shares):
             yield moved
 
     def returned(self, best: Explanation) -> Explanation | None:
@@ -104,7 +104,8 @@ class _Search:
         return self.model.explanation(number[place], [found[k] for k in order.tolist()], height, shares)
 
     def _best_split(self, own: Ints, best: Explanation) -> tuple[int, int, list[AnchorHypothesis]] | None:
-        """Return the times and places that divide an interval (rows) best: places and times in turn, from several times on."""
+        """Return when the anchor leaves and arrives, as numbers of ranges in an interval (rows), and its two places, by which
+        these are the likeliest: places and times in turn, from several times on."""
         least = self.least
         if len(own) < 2 * least:
             return None
@@ -118,7 +119,8 @@ class _Search:
         for _ in range(MovePolicy.laps):
             pairs = sorted(waiting - tried)
             tried |= waiting
-            found = self.model.likeliest(best.height, [part for left, moment in pairs for part in (own[:left], own[moment:])])
+            parts = [part for leaves, arrives in pairs for part in (own[:leaves], own[arrives:])]
+            found = self.model.likeliest(best.height, parts)
             splits = []
             for places in zip(found[::2], found[1::2], strict=True):
                 one, other = (shares * self.model.likely(level, place, own) for place in places)
@@ -159,10 +161,10 @@ def _times(one: Floats, other: Floats, carried: Floats, least: int) -> tuple[flo
     low, high = least, len(one) - least
     until, since = (np.append(0.0, np.cumsum(each - carried)) for each in (one, other))
     begun = until[low : high + 1]
-    moment = int(np.argmax(np.maximum.accumulate(begun) - since[low : high + 1]))
-    left = int(np.argmax(begun[: moment + 1]))
+    arrives = int(np.argmax(np.maximum.accumulate(begun) - since[low : high + 1]))
+    leaves = int(np.argmax(begun[: arrives + 1]))
     rest = float(since[-1] + carried.sum())
     once = int(np.argmax(begun - since[low : high + 1]))
-    slowly = float(begun[left] - since[low + moment]) + rest - float(np.log(len(one)))
+    slowly = float(begun[leaves] - since[low + arrives]) + rest - float(np.log(len(one)))
     at_once = float(begun[once] - since[low + once]) + rest
-    return (slowly, (low + left, low + moment)) if slowly > at_once else (at_once, (low + once, low + once))
+    return (slowly, (low + leaves, low + arrives)) if slowly > at_once else (at_once, (low + once, low + once))

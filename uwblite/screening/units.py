@@ -135,11 +135,11 @@ def _other_stamps(log: SensorLog) -> str:
     for what, sensor in (("gyro", log.gyro), ("radio", log.ranges), ("lidar", log.scans)):
         if sensor is None or len(sensor.stamps) < _ENOUGH:
             continue
-        name = _finer(sensor.stamps, wheels)
-        odd, name = (what, name) if name else ("odometry", _finer(wheels, sensor.stamps))
-        if name:
+        unit = _finer(sensor.stamps, wheels)
+        odd, unit = (what, unit) if unit else ("odometry", _finer(wheels, sensor.stamps))
+        if unit:
             return (
-                f"the stamps of the {odd} look like {name}: odometry and {what} would last {np.ptp(wheels):.4g} s and "
+                f"the stamps of the {odd} look like {unit}: odometry and {what} would last {np.ptp(wheels):.4g} s and "
                 f"{np.ptp(sensor.stamps):.4g} s; write every stamp in seconds"
             )
     return ""

@@ -69,21 +69,22 @@ class PairPolicy:
 _NAN = float("nan")
 
 
-def factor(wheels: Floats, lidar: Floats, clear: float) -> float:
-    """Return the factor of the wheels' motions (e, d) that most agree on; nan where there are too few clear ones."""
-    size = np.sqrt(np.sum(wheels**2, axis=1))
+def times_as_large(others: Floats, motions: Floats, clear: float) -> float:
+    """Return how many times as large as motions (e, d) others of the same times (e, d) are, in the median over clear motions;
+    nan where there are too few."""
+    size = np.sqrt(np.sum(motions**2, axis=1))
     rows = size > clear
-    ratio = np.sum(wheels * lidar, axis=1)[rows] / size[rows] ** 2
+    ratio = np.sum(motions * others, axis=1)[rows] / size[rows] ** 2
     return float(np.median(ratio)) if len(ratio) >= PairPolicy.enough else _NAN
 
 
-def undiluted(wheels: Floats, lidar: Floats, clear: float, otherwise: float) -> float:
-    """Return the factor of the wheels' motions (e, d) to the lidar's; `otherwise` where there are too few clear ones.
+def lidar_by_wheels(wheels: Floats, lidar: Floats, clear: float, otherwise: float) -> float:
+    """Return how many times as large as the wheels' motions (e, d) the lidar's are; `otherwise` where too few are clear.
 
     Noise of one sensor, such as rounding, draws the ratio to its own motions down (regression dilution). So the ratio to the
     other's motions is taken as well, and of both the one that is nearer to 1.
     """
-    ratio, inverse = factor(wheels, lidar, clear), factor(lidar, wheels, clear)
+    ratio, inverse = times_as_large(lidar, wheels, clear), times_as_large(wheels, lidar, clear)
     if not (ratio > 0.0 and inverse > 0.0):
         return otherwise if np.isnan(ratio) else ratio
     return min(ratio, 1.0 / inverse, key=lambda value: abs(np.log(value)))
@@ -121,7 +122,7 @@ class Pairs(Table):
     def way_ratio(self) -> float:
         """The way by the lidar / the way by the wheels; nan where there are too few clear motions."""
         own = self.rows(self.measured)
-        return undiluted(own.wheels[:, :2], own.lidar[:, :2], PairPolicy.clear[0], _NAN)
+        return lidar_by_wheels(own.wheels[:, :2], own.lidar[:, :2], PairPolicy.clear[0], _NAN)
 
 
 def standing(odometry: Odometry, least: float = PairPolicy.least_stand) -> list[tuple[float, float]]:
@@ -251,7 +252,7 @@ def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> lis
     if len(own.start) < 2 * PairPolicy.enough:
         return []
     parts = slice(0, 2), slice(2, None)
-    way, turn = (undiluted(own.wheels[:, p], own.lidar[:, p], PairPolicy.moving, 1.0) for p in parts)
+    way, turn = (lidar_by_wheels(own.wheels[:, p], own.lidar[:, p], PairPolicy.moving, 1.0) for p in parts)
     wheels = own.wheels * np.array([way, way, turn])
     bad, more = np.zeros(len(own.start), dtype=bool), []
     drives = np.any(np.abs(own.lidar) > PairPolicy.moving, axis=1)
