@@ -10,7 +10,7 @@ from uwblite import se2
 from uwblite.graph.graph import Calibration
 from uwblite.io.carmen import read_log
 from uwblite.io.corrected_log import poses_of_scans, write_corrected_log
-from uwblite.sensor_log import SensorMounting
+from uwblite.sensor_log import LaserScans, SensorMounting
 
 MOUNT = np.array([0.2, -0.1, 0.3])
 
@@ -69,7 +69,7 @@ def test_a_corrected_log_is_a_log_with_the_same_mounting(tmp_path):
 def test_poses_are_asked_in_the_middle_of_the_scan_at_the_lidars_clock():
     stamps = np.arange(0.0, 10.0, 0.1)
     result = SimpleNamespace(stamps=stamps, trajectory=robot_at(stamps), graph=SimpleNamespace(calibration=Calibration()))
-    scans = SimpleNamespace(time_increment=0.01, ranges=np.zeros((1, 21)))
+    scans = LaserScans(np.zeros(1), np.zeros((1, 21), dtype=np.float32), 0.0, 0.1, 0.01, 0.0, 9.0)
     log = SimpleNamespace(scans=scans, mounting=SensorMounting(T_base_laser=MOUNT))
     laser, robot = poses_of_scans(result, log, np.array([2.0, 30.0]))
     np.testing.assert_allclose(robot[0], robot_at(np.array([2.1]))[0], atol=1e-3)

@@ -1,17 +1,28 @@
-"""The lidar's clock is found by the steps to which matching descends, before any is searched for."""
+"""The lidar's clock, and how long a scan takes, are found by the steps to which matching descends, before any search."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.planted import box, recording, scans, wander
 
 from uwblite.constraints import Constraints
-from uwblite.pipeline import neighbour_matching
+from uwblite.pipeline import calibration_checks, neighbour_matching
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.radio_stages import dead_reckoning
 from uwblite.pipeline.recordings import gather
 from uwblite.sensor_log import Odometry, SensorMounting
+
+
+def descended(log):
+    """Return the task of a recording, and its estimate and steps by the odometry and the clouds."""
+    config = MappingConfig()
+    recordings = gather([log], config.keyframes)
+    task = Task(recordings, config, Constraints(), Stages(None, None))
+    estimate = neighbour_matching.make_clouds(dead_reckoning(recordings.each[0], config), task)
+    return task, *neighbour_matching._descended(estimate, task)
 
 
 @pytest.mark.parametrize("late", [0.0, 0.08])
@@ -22,12 +33,47 @@ def test_keyframes_and_clouds_follow_the_lidar_s_clock(late):
     seen = scans(stamps, truth, box(9, 7), rate=10.0, beams=120, sweep=0.0)
     seen = seen.rows(np.arange(5, len(seen.stamps) - 5))
     log = recording(Odometry(stamps, truth), None, seen, mounting=SensorMounting()).with_later_scans(late)
-    config = MappingConfig()
-    recordings = gather([log], config.keyframes)
-    task = Task(recordings, config, Constraints(), Stages(None, None))
-    estimate = neighbour_matching.make_clouds(dead_reckoning(recordings.each[0], config), task)
-    found, steps = neighbour_matching._with_clock_found(estimate, task)
+    task, estimate, steps = descended(log)
+    found, steps = neighbour_matching._with_clock_found(estimate, steps, task)
     assert found.lidar.delay == pytest.approx(-late, abs=0.005)
     assert (found.recordings is None) == (late == 0.0)
     assert np.mean(steps.share[steps.enough]) > 0.8
     assert [stage.name for stage in task.stages.done].count("scan-to-scan matching") == 0
+
+
+@pytest.mark.parametrize(
+    ("takes", "stated", "flipped"),
+    [(0.1, 0.0, False), (0.1, 0.0, True), (0.2, 0.1, False), (0.1, 0.1, False), (0.0, 0.0, True)],
+)
+def test_a_scan_takes_as_long_as_clouds_of_other_headings_show(takes, stated, flipped):
+    """Rays of a turning lidar, each cast at its own time; the log gives them the right middle and another duration."""
+    rng = np.random.default_rng(4)
+    stamps, truth = wander(rng, 80.0)
+    mounting = SensorMounting(T_base_laser=np.array([0.1, 0.05, 0.4]), laser_flipped=flipped)
+    walls = np.concatenate([box(13, 11), box(1.5, 1.5) + 1.5])
+    seen = scans(stamps, truth, walls, beams=240, sweep=takes, noise=0.01, rng=rng, mounting=mounting)
+    seen = replace(seen.rows(np.arange(5, len(seen.stamps) - 5)), time_increment=0.0, stamps=seen.stamps[5:-5] + 0.5 * takes)
+    log = recording(Odometry(stamps, truth), None, seen, mounting=mounting).with_longer_scans(stated)
+    task, estimate, steps = descended(log)
+    found, steps = neighbour_matching._with_duration_found(estimate, steps, task)
+    facts = [fact.figures for fact in task.stages.facts if fact.kind == "scan-duration"]
+    if takes == stated:
+        assert found is estimate
+        assert not facts
+        return
+    (scans_now,) = (r.log.scans for r in found.recordings.each)
+    assert scans_now.duration == pytest.approx(takes, abs=calibration_checks.TOLERANCE)
+    np.testing.assert_allclose(scans_now.middles, seen.middles, atol=1e-9)
+    assert facts[0]["stated"] == pytest.approx(stated)
+    assert facts[0]["duration"] == scans_now.duration
+    assert np.mean(steps.share[steps.enough]) > 0.8
+
+
+def test_a_duration_that_is_switched_off_stays_as_stated():
+    rng = np.random.default_rng(4)
+    stamps, truth = wander(rng, 30.0)
+    seen = replace(scans(stamps, truth, box(13, 11), beams=240, sweep=0.1), time_increment=0.0)
+    task, estimate, steps = descended(recording(Odometry(stamps, truth), None, seen, mounting=SensorMounting()))
+    assert calibration_checks.missing_durations(estimate, steps, task)[0][0] > 0.02
+    off = replace(task.config, calibration=replace(task.config.calibration, scan_duration=0.0))
+    assert neighbour_matching._with_duration_found(estimate, steps, replace(task, config=off))[0] is estimate

@@ -21,7 +21,7 @@ RADIO = (
 )  # fmt: skip
 CLOCKS = (
     "clock-set-back", "clock-jump", "stamps-in-bursts", "stamps-of-receipt", "made-up-stamps", "late-scans", "late-ranges",
-    "clock-offset",
+    "clock-offset", "scan-duration",
     "ranges-outside-odometry", "scans-outside-odometry", "equal-stamps",
 )  # fmt: skip
 CUT = ("carried", "untied-parts", "loose-links", "odometry-gap", "odometry-breaks", "odometry-glitches", "no-closure")

@@ -20,7 +20,7 @@ def _of(*kinds: str | frozenset[str]) -> frozenset[str]:
     return frozenset().union(*(kind.split() if isinstance(kind, str) else kind for kind in kinds))
 
 
-_TIMES = _of("silences equal-stamps slow-odometry odometry-gap clock-offset")
+_TIMES = _of("silences equal-stamps slow-odometry odometry-gap clock-offset scan-duration")
 """What stamps that are no times look like."""
 _PLACES = _of(
     "anchor-distrusted anchor-mirror-ambiguous anchor-unplaced no-anchor moved-anchor anchors-moved-together",

@@ -200,6 +200,10 @@ TEXTS: Mapping[str, Text] = {
     "clock-offset": Text(
         "an offset of the lidar's clock ({offset:+.3f} s) grows when it is corrected: it is no constant, and none is used",
     ),
+    "scan-duration": Text(
+        "a scan takes {duration:.3f} s from its first ray to its last, not {stated:.3f} s as in the log: so scans from other "
+        "headings and at other velocities fit; to state it, set `laser_time_increment` to {increment:.6f} s",
+    ),
     "free-space-violation": Text(
         "{share:.0%} of what was seen on one visit to a place stands where another visit saw free space, and within one visit "
         "only {moving:.0%}: parts of the map are misplaced to each other; look at the closures in report.html",

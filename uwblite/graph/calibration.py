@@ -69,6 +69,8 @@ class CalibrationConfig:
     """Error of the laser's heading on the base, rad."""
     laser_delay: float = 0.1
     """Clock offset of the laser against the odometry, s."""
+    scan_duration: float = 0.1
+    """Error of the time from a scan's first ray to its last, s; used as far as the recording shows it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,7 +93,7 @@ class LiveReader:
             return []
         if self._T_base_laser is None:
             self._T_base_laser = mounted
-        sweep = scans.time_increment * (scans.ranges.shape[1] - 1)
+        sweep = scans.duration
         return [Measured("lidar", t, t + sweep, scans.rows(slice(k, k + 1))) for k, t in enumerate(scans.stamps.tolist())]
 
 

@@ -72,7 +72,7 @@ def poses_of_scans(result: MapResult, log: SensorLog, stamps: Floats) -> tuple[F
     """
     calibration, scans = result.graph.calibration, log.scans
     delay = calibration.get("laser_delay")
-    half = 0.0 if scans is None else 0.5 * scans.time_increment * (scans.ranges.shape[1] - 1)
+    half = 0.0 if scans is None else 0.5 * scans.duration
     robot = se2.interpolate_trajectory(result.stamps, result.trajectory, stamps + (delay + half)).reshape(-1, 3)
     slack = abs(delay) + half + _OUTSIDE
     robot[(stamps < result.stamps[0] - slack) | (stamps > result.stamps[-1] + slack)] = np.nan

@@ -94,6 +94,21 @@ class Steps:
         elsewhere = (np.hypot(off[:, 0], off[:, 1]) > PairPolicy.gate) | (np.abs(off[:, 2]) > PairPolicy.gate)
         return self.enough & ((self.share < PairPolicy.good_share) | elsewhere)
 
+    def pairs(self, keyframes: slice, most: int) -> tuple[Ints, Ints, Floats]:
+        """Return keyframes i, j (p,), 1, 2, 4, ... apart, up to `most`, between which all steps match, and T_i_j (p, 3)."""
+        T_i_j, apart = np.full((keyframes.stop, *se2.POSE), np.nan), 1
+        good = self.enough & (self.share >= PairPolicy.good_share) & (self.i >= keyframes.start) & (self.i < keyframes.stop)
+        T_i_j[self.i[good]] = self.pose[good]
+        found = []
+        while apart <= most:
+            known = np.flatnonzero(np.isfinite(T_i_j[:, 0]))
+            found.append((known, known + apart, T_i_j[known]))
+            T_i_j = se2.compose(T_i_j[:-apart], T_i_j[apart:])
+            apart *= 2
+        i, j, pose = (np.concatenate(of) for of in zip(*found, strict=True))
+        order = np.argsort(i, kind="stable")
+        return i[order], j[order], pose[order]
+
 
 def match_plainly(raster: CloudRasters, i: Ints, guess: Floats, gate: float) -> Steps:
     """Measure the steps from keyframes i (e,) to the next by their clouds, each from its guess (e, 3), within a gate, m."""

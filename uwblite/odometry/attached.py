@@ -110,7 +110,7 @@ def scan_points(log: SensorLog, keyframes: Keyframes, owner: Ints, chosen: Ints,
     scans, mounting = log.scans, log.mounting
     assert scans is not None
     beams = scans.ranges.shape[1]
-    start, end = scans.stamps[chosen], scans.stamps[chosen] + scans.time_increment * (beams - 1)
+    start, end = scans.stamps[chosen], scans.stamps[chosen] + scans.duration
     anchor = keyframes.odometry[owner]
     first = se2.between(anchor, log.odometry.at(start))
     sweep = se2.between(first, se2.between(anchor, log.odometry.at(end)))

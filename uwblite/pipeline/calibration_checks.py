@@ -11,11 +11,15 @@ from typing import ClassVar
 import numpy as np
 from scipy.special import softmax
 
-from ..arrays import ENOUGH, Floats
+from ..arrays import ENOUGH, TINY, Bools, Floats
 from ..errors import SolverError
 from ..graph.calibration import TURNING, with_free
 from ..graph.marginals import marginals
 from ..graph.solver import Optimizer, optimize
+from ..lidar.joint_refinement import RefinementConfig
+from ..lidar.scan_duration import PARTS, MovedRays, missing_duration
+from ..lidar.scan_matching import pairs_of
+from ..lidar.scan_to_scan import Steps
 from ..loop_closure.candidates import CandidatePolicy
 from ..odometry.wheels import turn_scales
 from ..problem.alternatives import EvidencePolicy
@@ -27,10 +31,9 @@ from .mapping_config import MappingConfig
 
 _OTHER_UNIT = 0.12
 """Relative error of travelled distance from which on it is not a wheel radius to be calibrated but another unit."""
-_TOLERANCE = 0.004
-"""Offset of the lidar's clock that clouds may have, s: an odometry that is wrong by 0.3 rad/s then costs 0.07 degrees."""
-_PARTS = 8
-"""Parts of a recording whose offsets are compared."""
+TOLERANCE = 0.004
+"""Offset of the lidar's clock, and error of a scan's duration, that clouds may have, s: an odometry that is wrong by 0.3 rad/s
+then costs 0.07 degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +119,9 @@ def without_known_calibration(config: MappingConfig, logs: Sequence[SensorLog]) 
     late = {sensor for log in logs if log.screening is not None for sensor in log.screening.in_bursts}
     if late or all(log.notes.one_clock for log in logs):
         priors = replace(priors, laser_delay=0.0, range_delay=0.0 if "odometry" in late else priors.range_delay)
+    if late:
+        # Between stamps of receipt the odometry does not tell how the robot moved during a scan.
+        priors = replace(priors, scan_duration=0.0)
     mounted = [log.mounting for log in logs if log.scans is not None]
     if mounted and all(mounting.laser_is_base for mounting in mounted):
         priors = replace(priors, laser_offset=0.0)
@@ -157,11 +163,29 @@ def late(estimate: Estimate, task: Task) -> float:
     calibration = estimate.graph.calibration
     at = calibration.index("laser_delay")
     off = calibration.get("laser_delay") - estimate.lidar.delay
-    if at < 0 or estimate.graph.fixed_calibration[at] or abs(off) < _TOLERANCE:
+    if at < 0 or estimate.graph.fixed_calibration[at] or abs(off) < TOLERANCE:
         return 0.0
     values, sigmas = _by_parts(estimate, at, task)
     prior = float(prior_sigma(estimate.graph)[at])
     return off if log_odds_of_constant(values - estimate.lidar.delay, sigmas, prior) > EvidencePolicy.positive else 0.0
+
+
+def missing_durations(estimate: Estimate, steps: Steps, task: Task) -> tuple[Floats, Bools]:
+    """Return by how much the scans of each recording (r,) take longer than their clouds were made with, s, as clouds show that
+    neighbouring steps place in each other, and whether that is more than clouds may have and evidently no 0."""
+    recordings, raster, prior = task.recordings, estimate.lidar.raster, task.config.calibration.scan_duration
+    missing, shown = np.zeros(len(recordings)), np.zeros(len(recordings), dtype=bool)
+    for recording in recordings.each:
+        log, k = recording.log, recording.number
+        if log.scans is None or prior == 0.0:
+            continue
+        i, j, T_i_j = steps.pairs(recording.rows, max(RefinementConfig.neighbours))
+        rays = MovedRays(raster, recordings.twist, log.scans, log.mounting)
+        values, sigmas = missing_duration(raster, pairs_of(raster.clouds, i, j, RefinementConfig.points), T_i_j, rays)
+        precision = sigmas**-2.0
+        missing[k] = values @ precision / max(precision.sum(), TINY)
+        shown[k] = abs(missing[k]) > TOLERANCE and log_odds_of_constant(values, sigmas, prior) > EvidencePolicy.positive
+    return missing, shown
 
 
 def _by_parts(estimate: Estimate, at: int, task: Task) -> tuple[Floats, Floats]:
@@ -170,7 +194,7 @@ def _by_parts(estimate: Estimate, at: int, task: Task) -> tuple[Floats, Floats]:
     values, sigmas = [], []
     for recording in task.following(estimate).recordings.each:
         rows = np.arange(recording.rows.start, recording.rows.stop)
-        for part in np.array_split(rows, max(1, min(_PARTS, len(rows) // ENOUGH))):
+        for part in np.array_split(rows, max(1, min(PARTS, len(rows) // ENOUGH))):
             try:
                 alone = optimize(stretch(problem, int(part[0]), int(part[-1]) + 1), rough(task.config.solver))[0]
                 sigma = float(marginals(alone).covariances.calibration[at])

@@ -178,6 +178,6 @@ def _sweeps(recording: Recording, graph: Graph) -> Sweeps:
     correction = np.array([cal.get("laser_x"), cal.get("laser_y"), cal.get("laser_theta")])
     mount = se2.compose(correction, mounting.T_base_laser)
     first = scans.stamps + cal.get("laser_delay")
-    last = first + scans.time_increment * (scans.ranges.shape[1] - 1)
+    last = first + scans.duration
     ends = [se2.compose(recording.dense_trajectory(graph.poses, stamps), mount) for stamps in (first, last)]
     return Sweeps(scans, ends[0], ends[1], mounting.laser_flipped)

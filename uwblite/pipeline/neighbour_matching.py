@@ -22,7 +22,7 @@ from . import calibration_checks, keyframe_data
 from .estimate import Estimate, Task
 from .keyframe_data import with_keyframes
 from .lidar_stages import refine
-from .recordings import denser, later
+from .recordings import denser, later, with_longer_scans
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +35,8 @@ class NeighbourPolicy:
     """Keyframes added within a doubtful step, at most."""
     retimings: ClassVar[int] = 5
     """Most times that clouds are made again; a quarter of the error remains each time."""
+    least_slope: ClassVar[float] = 0.5
+    """Least change of the duration that clouds of a scan show as missing per change of the one that they are made with."""
     inflation: ClassVar[float] = 10.0
     """Factor on the ranges' standard deviations."""
 
@@ -54,7 +56,8 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     Keyframes are then at the times of the scans: otherwise the odometry's velocity would have to bridge the offset. Clouds are
     made here, so that no reference keeps the replaced ones in memory.
     """
-    estimate, steps = _with_clock_found(make_clouds(estimate, task), task)
+    found = _with_duration_found(*_descended(make_clouds(estimate, task), task), task)
+    estimate, steps = _with_clock_found(*found, task.following(found[0]))
     task = task.following(estimate)
     # With ranges, which judge the path, steps that slipped are cut; else those that the clouds contradict.
     doubtful = steps.contradicted() & (estimate.ranges is None)
@@ -71,10 +74,33 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     return _match_neighbours(replace(estimate, odometry=track.slipped), track, task)
 
 
-def _with_clock_found(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
+def _with_duration_found(estimate: Estimate, steps: Steps, task: Task) -> tuple[Estimate, Steps]:
+    """Return the estimate with clouds of scans that take as long as neighbouring clouds show, and the steps between these.
+
+    Where the evidence shows that the log's duration is wrong, that at which clouds show no further error is found by secants.
+    """
+    stated = task.recordings
+    missing, shown = calibration_checks.missing_durations(estimate, steps, task)
+    longer = np.where(shown, missing, 0.0)
+    for _ in range(NeighbourPolicy.retimings):
+        if not (np.abs(longer) > calibration_checks.TOLERANCE).any():
+            break
+        estimate = replace(estimate, scans=None, recordings=with_longer_scans(task.recordings, longer))
+        task = task.following(estimate)
+        estimate = _with_clouds_at(estimate, 0.0, task)
+        steps, before = _steps(estimate, task), missing
+        missing = np.where(shown, calibration_checks.missing_durations(estimate, steps, task)[0], 0.0)
+        slope = (before - missing) / np.where(longer == 0.0, 1.0, longer)
+        longer = missing / np.clip(slope, NeighbourPolicy.least_slope, 1.0)
+    for old, new in zip(stated.each, task.recordings.each, strict=True):
+        if (was := old.log.scans) is not None and (now := new.log.scans) is not None and now is not was:
+            task.stages.note("scan-duration", stated=was.duration, duration=now.duration, increment=now.time_increment)
+    return estimate, steps
+
+
+def _with_clock_found(estimate: Estimate, steps: Steps, task: Task) -> tuple[Estimate, Steps]:
     """Return the estimate with keyframes and clouds at the lidar's clock, which the steps that the clouds measure show, and
     these steps; where that is the log's clock, the estimate is their optimum."""
-    estimate, steps = _descended(estimate, task)
     corrected = np.inf
     for _ in range(NeighbourPolicy.retimings):
         shown = _solved_with(steps, estimate, task)
@@ -128,10 +154,14 @@ def _at_delay(estimate: Estimate, late: float, delay: float, task: Task) -> Esti
     """Return the estimate with keyframes later by `late` s and clouds made for a lidar whose clock is late by `delay` s."""
     before = task.following(estimate).recordings
     estimate = with_keyframes(estimate, before, later(before, late))
-    task = task.following(estimate)
-    estimate = replace(estimate, scans=keyframe_data.make(task.recordings, task.config, delay, task.stages.work))
+    return _with_clouds_at(estimate, delay, task.following(estimate))
+
+
+def _with_clouds_at(estimate: Estimate, delay: float, task: Task) -> Estimate:
+    """Return the estimate with clouds made again for a lidar whose clock is late by `delay` s."""
+    scans = keyframe_data.make(task.recordings, task.config, delay, task.stages.work)
     task.stages.end("clouds made again", laser_delay=delay)
-    return estimate
+    return replace(estimate, scans=scans)
 
 
 def _descended(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:

@@ -198,6 +198,12 @@ def later(recordings: Recordings, shift: float) -> Recordings:
     return _joined([s.log for s in recordings.each], frames)
 
 
+def with_longer_scans(recordings: Recordings, longer: Floats) -> Recordings:
+    """Return the recordings whose scans each take longer by so much (r,), s, about the same middles."""
+    each = tuple(replace(r, log=r.log.with_longer_scans(d)) for r, d in zip(recordings.each, longer.tolist(), strict=True))
+    return replace(recordings, each=each)
+
+
 def denser(recordings: Recordings, steps: Ints, most: int, delay: float = 0.0) -> Recordings:
     """Return the recordings with the scans inside some steps as keyframes, too; clouds there are of single scans.
 

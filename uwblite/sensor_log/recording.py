@@ -174,6 +174,17 @@ class SensorLog:
             return self
         return replace(self, scans=replace(self.scans, stamps=self.scans.stamps + delay))
 
+    def with_longer_scans(self, longer: float) -> "SensorLog":
+        """Return the same recording with scans that take longer from the first ray to the last, s, about the same middles."""
+        if self.scans is None or longer == 0.0:
+            return self
+        beams = self.scans.ranges.shape[1]
+        more = longer / max(beams - 1, 1)
+        scans = replace(
+            self.scans, time_increment=self.scans.time_increment + more, stamps=self.scans.stamps - 0.5 * more * beams
+        )
+        return replace(self, scans=scans)
+
     def crop(self, start: float = -np.inf, end: float = np.inf) -> "SensorLog":
         """Return the part of the recording with start <= stamp <= end, s."""
 

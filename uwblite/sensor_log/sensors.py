@@ -149,6 +149,11 @@ class LaserScans(Table):
             return np.asarray((readings >= self.range_min) & (readings <= min(farthest, self.range_max)))
 
     @property
+    def duration(self) -> float:
+        """Time from the first ray of a scan to its last, s."""
+        return self.time_increment * max(self.ranges.shape[1] - 1, 0)
+
+    @property
     def middles(self) -> Floats:
         """(k,) s, time of the ray in the middle of each scan."""
         return self.stamps + 0.5 * self.time_increment * self.ranges.shape[1]
