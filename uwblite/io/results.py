@@ -101,13 +101,12 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
         write_pyfg(waiting / "graph.pyfg", result.graph, ids, result.keyframe_stamps, plain=plain)
         write_text(waiting / "graph_stamps.csv", stamps_csv(result))
         write_text(waiting / "config.toml", record.config)
-        heading = Heading(_title(logs), record.command, _lead(logs, result), _facts(logs, result, record))
+        heading = Heading(_title(logs), record.command, _lead(logs, result), _facts(logs, record))
         page = render(result, heading, grid_png)
         write_text(waiting / "report.html", page)
         hashes = {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(waiting.iterdir())}
         write_text(waiting / "report.json", json_lines(summary(logs, result, record, hashes)))
-        names = sorted((p.name for p in waiting.iterdir()), key=_order)
-    return names
+        return sorted((p.name for p in waiting.iterdir()), key=_order)
 
 
 def _order(name: str) -> tuple[int, str]:
@@ -138,7 +137,7 @@ def _lead(logs: Sequence[SensorLog], result: MapResult) -> str:
     return "; ".join(filter(None, (driven, size, closures)))
 
 
-def _facts(logs: Sequence[SensorLog], result: MapResult, record: RunRecord) -> tuple[tuple[str, str], ...]:
+def _facts(logs: Sequence[SensorLog], record: RunRecord) -> tuple[tuple[str, str], ...]:
     versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
     facts = (("settings", settings_line(record.preset, record.changed)), ("made by", versions))
     return tuple((name, value) for name, value in (*(("sha256", log.notes.sha256) for log in logs), *facts) if value)
