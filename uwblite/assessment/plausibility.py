@@ -3,7 +3,7 @@
 Each rule yields findings; docs/findings.md describes their kinds.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -22,7 +22,7 @@ from .causes import explained
 from .certainty import check_certainty, check_drifts, check_other_side
 from .facts import check_recordings, say
 from .range_agreement import DISAGREE, check_range_agreement, check_wheels_against_lidar
-from .residual_tests import check_range_scatter, check_residuals
+from .residual_tests import check_odometry, check_range_scatter, check_support
 from .sensor_checks import check_sensors
 from .untied_parts import check_untied_parts, check_untied_recordings
 
@@ -63,35 +63,37 @@ class ResultView:
     """m, see check_certainty."""
 
 
-RESULT_RULES: tuple[Callable[[ResultView], Iterable[Finding]], ...] = (
-    lambda view: say(view.task.stages.facts),
-    lambda view: check_repairs(view.task),
-    lambda view: check_certainty(view.estimate, view.sigma, view.task),
-    lambda view: check_anchors(view.anchors),
-    lambda view: check_range_agreement(view.anchors, view.table, view.task),
-    lambda view: check_moved_together(view.anchors, view.table, view.task),
-    lambda view: check_sensors([recording.log for recording in view.task.recordings.each]),
-    lambda view: check_closures(view.estimate, view.grid),
-    lambda view: check_calibration(view.calibrated, view.usual, view.task),
-    lambda view: check_lengths(view.estimate, view.task),
-    lambda view: check_residuals(view.estimate, view.table.get("residual", np.zeros(0)), view.grid, view.task),
-    lambda view: check_drifts(view.estimate, view.task),
-    lambda view: check_untied_parts(view.estimate, view.task),
-    lambda view: check_untied_recordings(view.estimate, view.task),
-    lambda view: check_other_side(view.estimate, view.task),
-    lambda view: check_handedness(view.estimate, view.task),
-    lambda view: check_fit(view.task),
-    lambda view: check_wheels_against_lidar(view.table, view.anchors, view.task),
-)
-"""In this order: a rule may look at what those before it found."""
-
-
 def judge(view: ResultView) -> None:
     """Add the findings that the recordings, the stages and the finished estimate give rise to, causes before consequences."""
     findings = view.task.stages.findings
-    for rule in RESULT_RULES:
-        findings.extend(rule(view))
+    for finding in _findings(view):
+        findings.append(finding)
     findings[:] = explained(findings, partial(_left_without, view))
+
+
+def _findings(view: ResultView) -> Iterator[Finding]:
+    """Yield the findings of all rules; a rule may look at what those before it have added to the stages' findings."""
+    estimate, task, anchors, table, grid = view.estimate, view.task, view.anchors, view.table, view.grid
+    yield from say(task.stages.facts)
+    yield from check_repairs(task)
+    yield from check_certainty(estimate, view.sigma, task)
+    yield from check_anchors(anchors)
+    yield from check_range_agreement(anchors, table, task)
+    yield from check_moved_together(anchors, table, task)
+    yield from check_sensors([recording.log for recording in task.recordings.each])
+    yield from check_closures(estimate, grid)
+    yield from check_calibration(view.calibrated, view.usual, task)
+    yield from check_lengths(estimate, task)
+    yield from check_range_scatter(estimate, table.get("residual", np.zeros(0)), grid, task)
+    yield from check_odometry(estimate, task)
+    yield from check_support(estimate, task)
+    yield from check_drifts(estimate, task)
+    yield from check_untied_parts(estimate, task)
+    yield from check_untied_recordings(estimate, task)
+    yield from check_other_side(estimate, task)
+    yield from check_handedness(estimate, task)
+    yield from check_fit(task)
+    yield from check_wheels_against_lidar(table, anchors, task)
 
 
 def _left_without(view: ResultView, cause: Finding) -> set[tuple[str, str]]:

@@ -57,13 +57,6 @@ def between_keyframes(finding: Finding, recordings: Recordings, *spans: tuple[in
     return replace(finding, recording=number, stretches=stretches, cure=cure)
 
 
-def check_residuals(estimate: Estimate, residuals: Floats, grid: OccupancyGrid | None, task: Task) -> Iterator[Finding]:
-    """Doubt a map that the residuals of ranges and odometry contradict."""
-    yield from check_range_scatter(estimate, residuals, grid, task)
-    yield from check_odometry(estimate, task)
-    yield from check_support(estimate, task)
-
-
 def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGrid | None, task: Task) -> Iterator[Finding]:
     """Compare how ranges scatter about the map with how they scatter from one to the next.
 
