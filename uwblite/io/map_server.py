@@ -105,7 +105,7 @@ def read_map(path: str | os.PathLike[str], warnings: list[str] | None = None) ->
         raise FormatError(f"mode {mode} is not read; save the map as trinary, scale or raw", name)
     negate = str(settings.get("negate", "0")).lower() in ("1", "true")
     log_odds = _log_odds(pixels, negate, occupied, free, mode)
-    if mode == "trinary" and not negate and (count := _keep_unknown(log_odds, pixels, free)):
+    if mode == "trinary" and not negate and (count := _keep_unknown(log_odds, pixels)):
         remarks.append(
             f"{count} cells have the grey of unknown ones ({PIXEL_UNKNOWN}), which free_thresh {free:g} would make free: they"
             " stay unknown (free_thresh: 0.196 says so to every program)"
@@ -128,10 +128,8 @@ def _origin(settings: Settings, name: str) -> list[float]:
     return [_number(item, "origin", name) for item in value]
 
 
-def _keep_unknown(log_odds: NDArray[np.float32], pixels: Image, free: float) -> int:
+def _keep_unknown(log_odds: NDArray[np.float32], pixels: Image) -> int:
     """Make cells of the grey of unknown ones unknown where the threshold makes them free; return how many there were."""
-    if not free > 1.0 - PIXEL_UNKNOWN / 255.0:
-        return 0
     grey = pixels[:, :, 0] == PIXEL_UNKNOWN
     for channel in range(1, 3 if pixels.shape[2] >= 3 else 1):
         grey &= pixels[:, :, channel] == PIXEL_UNKNOWN

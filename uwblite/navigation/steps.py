@@ -225,8 +225,6 @@ def _joins(clearance: ClearanceMap) -> csr_matrix:
     """Return the costs (tight places, cells and tight places) of the steps from each tight place to what is near."""
     grid, tight = clearance.geometry, clearance.tight
     shape = (len(tight), grid.cells + len(tight))
-    if not len(tight):
-        return csr_matrix(shape)
     at = np.rint(2.0 * (tight - grid.origin) / grid.resolution).astype(np.intp)  # half cells
     names = at[:, 1] * (2 * grid.cols + 1) + at[:, 0]
     order = np.argsort(names)

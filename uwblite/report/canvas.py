@@ -118,9 +118,7 @@ class Canvas:
         self._dab(centres, radius, colour, 1.0)
 
     def polygon(self, points: Floats, colour: Colour, opacity: float = 1.0) -> None:
-        """Fill a convex polygon (n, 2), corners in either order."""
-        if not np.isfinite(points).all():
-            return
+        """Fill a convex polygon (n, 2), finite, corners in either order."""
         low = np.clip(np.floor(points.min(axis=0)), 0, self.size).astype(int)
         high = np.clip(np.ceil(points.max(axis=0)), 0, self.size).astype(int)
         if (high > low).all():
