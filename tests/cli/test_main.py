@@ -213,10 +213,10 @@ def test_a_usage_error_is_short_and_reports_what_was_meant(words, output, capsys
     assert second == f"`uwblite {words[0]} --help` shows the options, examples first"
 
 
-def test_numerical_libraries_have_one_thread_unless_the_environment_says_otherwise():
-    names = ["OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"]
+def test_numerical_libraries_have_one_thread_and_small_pages_unless_the_environment_says_otherwise():
+    names = ["OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMPY_MADVISE_HUGEPAGE"]
     code = f"import os; from uwblite.__main__ import start; start(); print(*map(os.getenv, {names}))"
     environment = {k: v for k, v in os.environ.items() if k not in names} | {"OMP_NUM_THREADS": "3"}
     program = [sys.executable, "-c", code, "--version"]
     done = subprocess.run(program, env=environment, capture_output=True, text=True, check=True, timeout=60)
-    assert done.stdout.splitlines()[-1] == "1 3 1"
+    assert done.stdout.splitlines()[-1] == "1 3 1 0"
