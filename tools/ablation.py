@@ -162,6 +162,7 @@ INGREDIENTS: dict[str, LeftOut] = {
     "laser_offset": _fixed("laser_offset"),
     "laser_angle": _fixed("laser_angle"),
     "laser_delay": _fixed("laser_delay"),
+    "scan_duration": _fixed("scan_duration"),
     "range_delay": _fixed("range_delay"),
     "tag_offset": _fixed("tag_offset"),
     **{
