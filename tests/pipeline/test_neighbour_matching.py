@@ -77,3 +77,16 @@ def test_a_duration_that_is_switched_off_stays_as_stated():
     assert calibration_checks.missing_durations(estimate, steps, task)[0][0] > 0.02
     off = replace(task.config, calibration=replace(task.config.calibration, scan_duration=0.0))
     assert neighbour_matching._with_duration_found(estimate, steps, replace(task, config=off))[0] is estimate
+
+
+def test_an_error_that_grows_when_it_is_corrected_is_not_one_of_the_duration(monkeypatch):
+    rng = np.random.default_rng(4)
+    stamps, truth = wander(rng, 20.0)
+    seen = scans(stamps, truth, box(13, 11), beams=120, sweep=0.0)
+    task, estimate, steps = descended(recording(Odometry(stamps, truth), None, seen, mounting=SensorMounting()))
+    shown = iter([(0.015, True), (0.022, True), (0.015, True)])
+    monkeypatch.setattr(calibration_checks, "missing_durations", lambda *_: tuple(np.array([v]) for v in next(shown)))
+    found, _ = neighbour_matching._with_duration_found(estimate, steps, task)
+    assert found.recordings.each[0].log.scans.duration == 0.0
+    np.testing.assert_array_equal(found.lidar.clouds.points, estimate.lidar.clouds.points)
+    assert not task.stages.facts

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
-from uwblite.problem.evidence import _log_odds, log_marginal_likelihood, log_odds_of_constant, without_prior
+from uwblite.problem.evidence import log_marginal_likelihood, log_odds_by_parts, log_odds_of_constant, without_prior
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -48,7 +48,7 @@ def test_without_scatter_they_are_the_bayes_factor():
     factor = multivariate_normal.logpdf(values, cov=np.diag(sigmas**2) + 1e-6) - multivariate_normal.logpdf(
         values, cov=np.diag(sigmas**2)
     )
-    assert _log_odds(values, sigmas, 1e-3) == pytest.approx(factor, abs=0.01)
+    assert log_odds_by_parts(values, sigmas, 1e-3) == pytest.approx(factor, abs=0.01)
 
 
 def test_scatter_is_integrated_out_with_a_uniform_prior_of_its_logarithm():
@@ -60,7 +60,7 @@ def test_scatter_is_integrated_out_with_a_uniform_prior_of_its_logarithm():
         return multivariate_normal.pdf(values, cov=np.diag(variance) + constant * PRIOR**2)
 
     with_it, without = (quad(likelihood, np.log(low), np.log(high), args=(c,), limit=200)[0] for c in (1.0, 0.0))
-    assert _log_odds(values, sigmas, PRIOR) == pytest.approx(np.log(with_it / without), abs=0.1)
+    assert log_odds_by_parts(values, sigmas, PRIOR) == pytest.approx(np.log(with_it / without), abs=0.1)
 
 
 def test_odds_of_a_constant_are_what_they_say():

@@ -23,7 +23,7 @@ from ..lidar.scan_to_scan import Steps
 from ..loop_closure.candidates import CandidatePolicy
 from ..odometry.wheels import turn_scales
 from ..problem.alternatives import EvidencePolicy
-from ..problem.evidence import log_odds_of_constant, prior_sigma, with_prior_sigma, without_prior
+from ..problem.evidence import log_odds_by_parts, log_odds_of_constant, prior_sigma, with_prior_sigma, without_prior
 from ..problem.solution import rough, stretch
 from ..sensor_log import SensorLog
 from .estimate import Estimate, Task
@@ -184,7 +184,7 @@ def missing_durations(estimate: Estimate, steps: Steps, task: Task) -> tuple[Flo
         values, sigmas = missing_duration(raster, pairs_of(raster.clouds, i, j, RefinementConfig.points), T_i_j, rays)
         precision = sigmas**-2.0
         missing[k] = values @ precision / max(precision.sum(), TINY)
-        shown[k] = abs(missing[k]) > TOLERANCE and log_odds_of_constant(values, sigmas, prior) > EvidencePolicy.positive
+        shown[k] = abs(missing[k]) > TOLERANCE and log_odds_by_parts(values, sigmas, prior) > EvidencePolicy.positive
     return missing, shown
 
 

@@ -78,20 +78,23 @@ def _with_duration_found(estimate: Estimate, steps: Steps, task: Task) -> tuple[
     """Return the estimate with clouds of scans that take as long as neighbouring clouds show, and the steps between these.
 
     Where the evidence shows that the log's duration is wrong, that at which clouds show no further error is found by secants.
+    An error that grows when it is corrected is not one of the duration, which then stays as stated.
     """
     stated = task.recordings
-    missing, shown = calibration_checks.missing_durations(estimate, steps, task)
-    longer = np.where(shown, missing, 0.0)
+    first, shown = calibration_checks.missing_durations(estimate, steps, task)
+    missing = change = longer = np.where(shown, first, 0.0)
     for _ in range(NeighbourPolicy.retimings):
-        if not (np.abs(longer) > calibration_checks.TOLERANCE).any():
+        if not (np.abs(change) > calibration_checks.TOLERANCE).any():
             break
-        estimate = replace(estimate, scans=None, recordings=with_longer_scans(task.recordings, longer))
+        estimate = replace(estimate, scans=None, recordings=with_longer_scans(stated, longer))
         task = task.following(estimate)
         estimate = _with_clouds_at(estimate, 0.0, task)
         steps, before = _steps(estimate, task), missing
-        missing = np.where(shown, calibration_checks.missing_durations(estimate, steps, task)[0], 0.0)
-        slope = (before - missing) / np.where(longer == 0.0, 1.0, longer)
-        longer = missing / np.clip(slope, NeighbourPolicy.least_slope, 1.0)
+        missing = calibration_checks.missing_durations(estimate, steps, task)[0]
+        shown &= np.abs(missing) < np.abs(first)
+        slope = (before - missing) / np.where(change == 0.0, 1.0, change)
+        change = np.where(shown, missing / np.clip(slope, NeighbourPolicy.least_slope, 1.0), -longer)
+        longer = longer + change
     for old, new in zip(stated.each, task.recordings.each, strict=True):
         if (was := old.log.scans) is not None and (now := new.log.scans) is not None and now is not was:
             task.stages.note("scan-duration", stated=was.duration, duration=now.duration, increment=now.time_increment)

@@ -112,11 +112,11 @@ def log_odds_of_constant(values: Floats, sigmas: Floats, prior: float) -> float:
     means = np.bincount(second, values * sigmas**-2.0, 2) / np.maximum(total, _TINY)
     with np.errstate(divide="ignore"):
         of_halves = np.asarray(total**-0.5, dtype=np.float64)
-    return min(_log_odds(values, sigmas, prior), _log_odds(means, of_halves, prior))
+    return min(log_odds_by_parts(values, sigmas, prior), log_odds_by_parts(means, of_halves, prior))
 
 
-def _log_odds(values: Floats, sigmas: Floats, prior: float) -> float:
-    """Return the logarithm of the odds of a constant with the prior N(0, prior^2) against 0.
+def log_odds_by_parts(values: Floats, sigmas: Floats, prior: float) -> float:
+    """Return the logarithm of the odds of a constant with the prior N(0, prior^2) against 0, where no value changes once.
 
     Each part's estimate is N(v, s^2 + t^2) with the common value v; the scatter t has a uniform prior of its logarithm, and is
     integrated out on either side.
