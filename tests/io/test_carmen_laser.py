@@ -66,3 +66,14 @@ def test_lines_that_are_read_together_are_those_that_are_read_one_by_one(lines):
         assert sorted(mine.numbers) == sorted(others.numbers)
         np.testing.assert_array_equal(np.sort(mine.ranges), np.sort(others.ranges))
     assert sorted(together.laser._poses) == sorted(one_by_one.laser._poses)
+
+
+def test_a_message_that_ends_with_its_first_reading_is_too_short():
+    """Alone of its kind in a block, it would be taken with others that begin alike: there is no blank behind the first."""
+    head = b"RAWLASER1 0 0 1 0.1 8 0 0 2 "
+    reader = LogReader("log", 1, 1.0)
+    reader.feed(b"ODOM 0 0 0 0 0 0 1 r 1\n" + head + b"1.00 2.00 0 2 r 2\n")
+    assert not reader.broken
+    reader.feed(head + b"1." + b"0" * (len(head) - 4) + b"\n")
+    assert reader.broken == 1
+    assert "too short" in str(reader.broken_lines)

@@ -251,8 +251,7 @@ def test_against_stamps_of_receipt_no_clock_has_an_offset(late, radio, lidar):
     logs = [log_of(STANDING, MOMENTS, lidar=True, screening=Screening((), OdometryBreaks.none(), in_bursts=s)) for s in late]
     config = MappingConfig()
     found = without_known_calibration(config, logs)
-    of_scans = 0.0 if any(late) else config.calibration.scan_duration
-    expected = replace(config.calibration, range_delay=radio, laser_delay=lidar, scan_duration=of_scans)
+    expected = replace(config.calibration, range_delay=radio, laser_delay=lidar)
     assert found == replace(config, calibration=expected)
 
 

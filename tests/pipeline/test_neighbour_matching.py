@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted import box, recording, scans, wander
+from helpers.planted import box, odometry, recording, scans, wander
 
 from uwblite.constraints import Constraints
 from uwblite.pipeline import calibration_checks, neighbour_matching
@@ -13,7 +13,7 @@ from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.radio_stages import dead_reckoning
 from uwblite.pipeline.recordings import gather
-from uwblite.sensor_log import Odometry, SensorMounting
+from uwblite.sensor_log import Odometry, OdometryBreaks, Screening, SensorMounting
 
 
 def descended(log):
@@ -74,9 +74,24 @@ def test_a_duration_that_is_switched_off_stays_as_stated():
     stamps, truth = wander(rng, 30.0)
     seen = replace(scans(stamps, truth, box(13, 11), beams=240, sweep=0.1), time_increment=0.0)
     task, estimate, steps = descended(recording(Odometry(stamps, truth), None, seen, mounting=SensorMounting()))
-    assert calibration_checks.missing_durations(estimate, steps, task)[0][0] > 0.02
+    assert calibration_checks.missing_durations(estimate, steps, task)[1].all()
+    received = replace(task.recordings.each[0].log, screening=Screening((), OdometryBreaks.none(), in_bursts=("odometry",)))
+    each = (replace(task.recordings.each[0], log=received),)
+    bursts = replace(task, recordings=replace(task.recordings, each=each))
+    assert not calibration_checks.missing_durations(estimate, steps, bursts)[1].any()
     off = replace(task.config, calibration=replace(task.config.calibration, scan_duration=0.0))
     assert neighbour_matching._with_duration_found(estimate, steps, replace(task, config=off))[0] is estimate
+
+
+@pytest.mark.parametrize("scale", [0.85, 1.15])
+def test_turns_that_the_wheels_count_wrongly_are_no_duration_of_scans(scale):
+    """Rays are placed by the wheels' turns: where these are wrong by some share, so seems a duration that is stated rightly."""
+    rng = np.random.default_rng(4)
+    stamps, truth = wander(rng, 80.0)
+    walls = np.concatenate([box(13, 11), box(1.5, 1.5) + 1.5])
+    seen = scans(stamps, truth, walls, beams=240, sweep=0.1, noise=0.01, rng=rng)
+    task, estimate, steps = descended(recording(odometry(stamps, truth, turn_scale=scale), None, seen))
+    assert not calibration_checks.missing_durations(estimate, steps, task)[1].any()
 
 
 def test_an_error_that_grows_when_it_is_corrected_is_not_one_of_the_duration(monkeypatch):

@@ -200,10 +200,6 @@ TEXTS: Mapping[str, Text] = {
     "clock-offset": Text(
         "an offset of the lidar's clock ({offset:+.3f} s) grows when it is corrected: it is no constant, and none is used",
     ),
-    "scan-duration": Text(
-        "a scan takes {duration:.3f} s from its first ray to its last, not {stated:.3f} s as in the log: so scans from other "
-        "headings and at other velocities fit; to state it, set `laser_time_increment` to {increment:.6f} s",
-    ),
     "free-space-violation": Text(
         "{share:.0%} of what was seen on one visit to a place stands where another visit saw free space, and within one visit "
         "only {moving:.0%}: parts of the map are misplaced to each other; look at the closures in report.html",
@@ -309,6 +305,17 @@ def wheels_against_lidar(start: float, stretches: Sequence[tuple[float, float]],
             "than elsewhere; cut that part off, or drive it again"
         )
     return Finding("wheels-against-lidar", WARNING if slips else DOUBT, text, stretches=tuple(stretches))
+
+
+@_rule
+def scan_duration(recording: int, name: str, stated: float, duration: float, increment: float) -> Finding:
+    """Warn of scans whose rays are of other times than the log says."""
+    text = (
+        f"{f'{name}: ' if name else ''}a scan takes {duration:.3f} s from its first ray to its last, about the moment in its "
+        f"middle by the log, not {stated:.3f} s: so scans from other headings and at other velocities fit; to state it, set "
+        f"`laser_time_increment` to {increment:.6f} s and stamp scans {0.5 * (duration - stated):.3f} s earlier"
+    )
+    return Finding("scan-duration", WARNING, text, recording=recording, figures={"duration": duration, "stated": stated})
 
 
 @_rule

@@ -203,6 +203,7 @@ class Dwm1001Driver(Driver):
 
     def _ask_shell(self) -> Script[None]:
         texts: list[str] = []
+        self.joined = None
         yield Send(b"si\r")
         until = self.now + 1.0
         while (event := (yield Wait(until))) is not None and not (texts and isinstance(event, Prompt)):

@@ -131,12 +131,13 @@ class LogReader:
     def _take_kinds(self, lines: list[bytes], before: int) -> list[int]:
         """Take the messages of a kind together where all of a block are sound and written alike; return which lines are left.
 
-        `before` is the number of the first line. Until it is known whether the log has ipc_timestamp, lines come one by one.
+        `before` is the number of the first line. Until it is known whether the log has ipc_timestamp, lines come one by one,
+        and so do those of a block with tabs behind names.
         """
         kinds = defaultdict[bytes, list[int]](list)
         for k, line in enumerate(lines):
             kinds[line[: line.find(b" ")]].append(k)
-        if not self.has_ipc and any(name in self.handlers for name in kinds):
+        if (not self.has_ipc and any(name in self.handlers for name in kinds)) or any(b"\t" in name for name in kinds):
             return list(range(len(lines)))
         left = list[int]()
         alone = sum(name.startswith(b"UWB") for name in kinds) == 1, sum(name in self.laser.kinds for name in kinds) == 1

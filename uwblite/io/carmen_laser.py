@@ -146,6 +146,8 @@ class LaserMessages:
         if name != self._kind or layout is None or not all(line.startswith(self._head) for line in lines):
             return False
         width = lines[0].find(b" ", head) - head
+        if width < 1:
+            return False
         end = head + layout.beams * (width + 1)
         tails = columns_of([line[end:] for line in lines], len(lines[0][end:].split()))
         if not tails or (name != b"FLASER" and len(set(tails[0])) > 1):

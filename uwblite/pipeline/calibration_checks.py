@@ -119,9 +119,6 @@ def without_known_calibration(config: MappingConfig, logs: Sequence[SensorLog]) 
     late = {sensor for log in logs if log.screening is not None for sensor in log.screening.in_bursts}
     if late or all(log.notes.one_clock for log in logs):
         priors = replace(priors, laser_delay=0.0, range_delay=0.0 if "odometry" in late else priors.range_delay)
-    if late:
-        # Between stamps of receipt the odometry does not tell how the robot moved during a scan.
-        priors = replace(priors, scan_duration=0.0)
     mounted = [log.mounting for log in logs if log.scans is not None]
     if mounted and all(mounting.laser_is_base for mounting in mounted):
         priors = replace(priors, laser_offset=0.0)
@@ -172,19 +169,26 @@ def late(estimate: Estimate, task: Task) -> float:
 
 def missing_durations(estimate: Estimate, steps: Steps, task: Task) -> tuple[Floats, Bools]:
     """Return by how much the scans of each recording (r,) take longer than their clouds were made with, s, as clouds show that
-    neighbouring steps place in each other, and whether that is more than clouds may have and evidently no 0."""
-    recordings, raster, prior = task.recordings, estimate.lidar.raster, task.config.calibration.scan_duration
+    neighbouring steps place in each other, and whether that is evidently no 0 and more than clouds may have, or than turns
+    of the wheels that are wrong by their prior look like.
+
+    Between stamps of receipt the odometry does not tell how the robot moved during a scan.
+    """
+    recordings, raster, config = task.recordings, estimate.lidar.raster, task.config.calibration
     missing, shown = np.zeros(len(recordings)), np.zeros(len(recordings), dtype=bool)
     for recording in recordings.each:
         log, k = recording.log, recording.number
-        if log.scans is None or prior == 0.0:
+        receipt = log.screening is not None and log.screening.in_bursts
+        if log.scans is None or receipt or config.scan_duration == 0.0:
             continue
         i, j, T_i_j = steps.pairs(recording.rows, max(RefinementConfig.neighbours))
         rays = MovedRays(raster, recordings.twist, log.scans, log.mounting)
         values, sigmas = missing_duration(raster, pairs_of(raster.clouds, i, j, RefinementConfig.points), T_i_j, rays)
         precision = sigmas**-2.0
         missing[k] = values @ precision / max(precision.sum(), TINY)
-        shown[k] = abs(missing[k]) > TOLERANCE and log_odds_by_parts(values, sigmas, prior) > EvidencePolicy.positive
+        tolerance = max(TOLERANCE, config.heading_scale * abs(log.scans.duration))
+        evident = log_odds_by_parts(values, sigmas, config.scan_duration) > EvidencePolicy.positive
+        shown[k] = evident and abs(missing[k]) > tolerance
     return missing, shown
 
 

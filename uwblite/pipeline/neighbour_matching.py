@@ -97,7 +97,14 @@ def _with_duration_found(estimate: Estimate, steps: Steps, task: Task) -> tuple[
         longer = longer + change
     for old, new in zip(stated.each, task.recordings.each, strict=True):
         if (was := old.log.scans) is not None and (now := new.log.scans) is not None and now is not was:
-            task.stages.note("scan-duration", stated=was.duration, duration=now.duration, increment=now.time_increment)
+            task.stages.note(
+                "scan-duration",
+                recording=new.number + 1,
+                name=new.name if len(stated) > 1 else "",
+                stated=was.duration,
+                duration=now.duration,
+                increment=now.time_increment,
+            )
     return estimate, steps
 
 
