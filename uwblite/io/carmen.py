@@ -142,13 +142,14 @@ class LogReader:
         left = list[int]()
         alone = sum(name.startswith(b"UWB") for name in kinds) == 1, sum(name in self.laser.kinds for name in kinds) == 1
         for name, rows in kinds.items():
-            own, numbers = [lines[k] for k in rows], np.array(rows) + before
+            own, line_numbers = [lines[k] for k in rows], np.array(rows) + before
             if name == b"ODOM":
-                taken = self._take_odometry(own, numbers)
+                taken = self._take_odometry(own, line_numbers)
             elif name == b"UWB":
-                taken = alone[0] and self._take_ranges(own, numbers)
+                taken = alone[0] and self._take_ranges(own, line_numbers)
             else:
-                taken = name in self.laser.kinds and alone[1] and self.laser.take_alike(self.laser.kinds[name], own, numbers)
+                kind = self.laser.kinds.get(name)
+                taken = kind is not None and alone[1] and self.laser.take_alike(kind, own, line_numbers)
             if taken:
                 self.messages += len(rows)
             else:

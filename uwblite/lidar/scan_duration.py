@@ -24,22 +24,20 @@ class MovedRays:
     def __init__(self, raster: CloudRasters, twist: Floats, scans: LaserScans, mounting: SensorMounting) -> None:
         """Take clouds made from scans, and the velocity (k, 3) of the base at the keyframes, m/s, m/s, rad/s."""
         self._clouds, self._twist, self._laser = raster.clouds, twist, mounting.T_base_laser
-        spanned = scans.angle_increment * (scans.ranges.shape[1] - 1)
-        self._middle = scans.angle_min + 0.5 * spanned
-        self._spanned = -spanned if mounting.laser_flipped else spanned
-        self._turned = self._laser[2] + (-self._middle if mounting.laser_flipped else self._middle)
+        spanned, sign = scans.angle_increment * (scans.ranges.shape[1] - 1), -1.0 if mounting.laser_flipped else 1.0
+        self._spanned, self._middle = sign * spanned, self._laser[2] + sign * (scans.angle_min + 0.5 * spanned)
 
     def per_second(self, rows: Ints) -> tuple[Floats, Floats]:
         """Return the motion (...), (...) of points in x and y of their cloud, m/s, by rows (...) in the clouds' arrays."""
         points = self._clouds.points[rows].astype(np.float64)
-        bearing = se2.bearing(points - self._laser[:2]) - self._turned
+        bearing = se2.bearing(points - self._laser[:2]) - self._middle
         share = se2.wrap_angle(bearing) / self._spanned
         vx, vy, turn = np.moveaxis(self._twist[self._clouds.owner[rows]], -1, 0)
         return share * (vx - turn * points[..., 1]), share * (vy + turn * points[..., 0])
 
 
 def missing_duration(raster: CloudRasters, pairs: CloudPairs, T_i_j: Floats, rays: MovedRays) -> tuple[Floats, Floats]:
-    """Return the missing duration of a scan in parts of a recording (p,), and its standard deviation (p,), s.
+    """Return the missing duration of a scan in parts of a recording (p,) that show one, and its standard deviation (p,), s.
 
     Parameters
     ----------

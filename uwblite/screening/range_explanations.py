@@ -366,8 +366,8 @@ class Moment:
         """Yield what explains a change; nothing where nothing could.
 
         Where the likelihood with all anchors at any place exceeds that of the path by no very strong evidence nothing needs an
-        explanation, and where not by the prior odds of wrong wheels as well, hardly any other path
-        does: none is tried, unless it is to be compared.
+        explanation, and where not by the prior odds of wrong wheels as well, hardly any other path does: none is tried, unless
+        it is to be compared.
         """
         one, two, usual_motion = self.before, self.after, PathPolicy.usual_motion
         turns = np.arange(-np.pi, np.pi, PathPolicy.turn)
