@@ -89,8 +89,6 @@ def score_grid(
     headings = T_target_source[2] + np.arange(-turns, turns + 1) * config.angle_step
     shift_x, shift_y = np.arange(-wide, wide + 1), np.arange(-tall, tall + 1)
     scores = np.zeros((len(headings), len(shift_y), len(shift_x)), np.float32)
-    if not (target.normals.any() and source.normals.any()):
-        return scores, headings, shift_x, shift_y
     raster, reach = rasterize(target, config.resolution, _CELLS_PER_REACH * config.resolution), np.array([tall, wide])
     field = surface_field(raster, config.spread).T
     parts = [np.ascontiguousarray(part) for part in (field.real, field.imag)]
