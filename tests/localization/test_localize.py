@@ -55,6 +55,19 @@ def test_a_part_finds_its_place_in_the_whole(log, earlier):
     assert found.localized == 1.0
 
 
+def test_among_people_the_walls_are_those_of_the_map(log, earlier):
+    """They stand before a fifth of the rays, others at every look."""
+    few = part(log)
+    rng = np.random.default_rng(2)
+    people = np.repeat(rng.uniform(size=(len(few.scans.ranges), few.scans.ranges.shape[1] // 10 + 1)) < 0.2, 10, axis=1)
+    people = people[:, : few.scans.ranges.shape[1]]
+    seen = np.where(people, rng.uniform(0.5, 0.9, people.shape) * few.scans.ranges, few.scans.ranges)
+    found = localize(dataclasses.replace(few, scans=dataclasses.replace(few.scans, ranges=seen)), map_of(earlier))
+    assert np.sqrt(np.mean(errors(found, earlier) ** 2)) < 0.025
+    assert found.overlap == pytest.approx(1.0 - people.mean(), abs=0.03)
+    assert not found.doubts
+
+
 def test_without_walls_the_anchors_fix_the_place(log, earlier):
     found = localize(part(log).without(lidar=True), map_of(earlier))
     assert np.isnan(found.overlap)

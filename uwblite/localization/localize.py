@@ -23,8 +23,6 @@ from .known_map import KnownMap
 from .localizer import Localizer
 from .sensing import Scanner
 
-LEAST_OVERLAP = 0.4
-"""Share of the rays' ends in known space that must lie on walls of the map; the rest may be people, or what was moved."""
 LEAST_LOCALIZED = 0.8
 """Share of the poses that must be known, and on which both passes must agree."""
 _SPACING = (0.1, 0.1, 1.0)
@@ -105,7 +103,11 @@ def localize(log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progre
     rows = np.unique(np.append(_first_of_each(_way(log)), len(log.odometry.stamps) - 1))
     passes, doubts = _both(log, known, rows, progress), []
     if _lost(passes) and known.walls is not None and len(shared) >= 2:
-        doubts.append(_walls_differ(passes[0].reason, "; the position rests on the anchors alone"))
+        text = (
+            f"the walls do not lie on those of the map ({passes[0].reason}): the place has changed, or it is another; "
+            "the position rests on the anchors alone"
+        )
+        doubts.append(doubt("walls-differ", text))
         passes = _both(log, replace(known, walls=None), rows, progress)
     if _lost(passes):
         raise DataError(f"the recording is found nowhere in the map for certain: {passes[0].reason}")
@@ -119,8 +121,6 @@ def localize(log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progre
     for name in sorted({n for p in passes for n in p.moved_anchors}):
         text = f"anchor {name} does not stand where the map has it: it was moved; its ranges were left out"
         findings.append(warning("moved-anchor", text, anchor=name))
-    if overlap < LEAST_OVERLAP:
-        findings.append(_walls_differ(f"overlap {overlap:.0%}"))
     if localized < 1.0:
         reason = passes[0].reason or passes[1].reason or "measurements and map fell apart meanwhile"
         text = f"{1.0 - localized:.0%} of the recording is not localized and left out: {reason}"
@@ -156,11 +156,6 @@ def _both(log: SensorLog, known: KnownMap, rows: Ints, progress: Progress | None
 
 def _lost(passes: tuple[Pass, Pass]) -> bool:
     return not any(np.isfinite(p.poses).any() for p in passes)
-
-
-def _walls_differ(why: str, then: str = "") -> Finding:
-    text = f"the walls do not lie on those of the map ({why}): the place has changed, or it is another{then}"
-    return doubt("walls-differ", text)
 
 
 def _way(log: SensorLog) -> Floats:
