@@ -228,9 +228,48 @@ def findings_made_elsewhere(module):
             yield f"{module}:{node.lineno} makes a finding; note a fact, and let a rule of assessment/ say it"
 
 
+def records_by_value(module):
+    """Records with arrays, which have no one truth when they are compared, are compared by identity, and so are those that hold
+    such records; records do not change, but for a few that count or collect."""
+    for name, held, options in records_of(module):
+        if options.get("eq") != "False" and held & with_arrays():
+            yield f"{module} {name} compares arrays: eq=False"
+        if options.get("frozen") != "True" and name not in COLLECTING:
+            yield f"{module} {name} can be changed: frozen=True"
+
+
+COLLECTING = (
+    "Collector", "Counts", "PortReport", "RecordFile", "RunningFit", "Sensor", "Silence", "Window", "_Scans",
+)  # fmt: skip
+"""Records that change."""
+
+
+@cache
+def records_of(module):
+    """Return name, names in the annotations of its fields, and options of each dataclass."""
+    found = []
+    for node in nodes_of(module):
+        for decorator in getattr(node, "decorator_list", ()) if isinstance(node, ast.ClassDef) else ():
+            if getattr(getattr(decorator, "func", decorator), "id", "") == "dataclass":
+                fields = [ast.unparse(field.annotation) for field in node.body if isinstance(field, ast.AnnAssign)]
+                options = {word.arg: ast.unparse(word.value) for word in getattr(decorator, "keywords", ())}
+                found.append((node.name, frozenset(re.findall(r"\w+", " ".join(fields))), options))
+    return found
+
+
+@cache
+def with_arrays():
+    """Return the names of the kinds of arrays, and of records that hold some, at any depth."""
+    names = {"Floats", "Singles", "Ints", "Bools", "NDArray"}
+    every = [(name, held) for module in MODULES for name, held, _ in records_of(module)]
+    while more := {name for name, held in every if held & names} - names:
+        names |= more
+    return names
+
+
 RULES = (
     algorithms_in_files_and_devices, imports_from_above, imports_by_the_name_of_the_package, noise_and_impurity,
-    numbers_of_a_fixed_width, mutable_state, options_in_messages, findings_made_elsewhere,
+    numbers_of_a_fixed_width, mutable_state, options_in_messages, findings_made_elsewhere, records_by_value,
 )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """A command in a process of its own ends with the one that started it."""
 
+import signal
 import socket
 import subprocess
 import sys
@@ -7,6 +8,9 @@ import time
 
 import pytest
 from helpers.served import PATIENCE
+
+from uwblite.cli import child as child_module
+from uwblite.cli.child import Child
 
 PARENT = "import sys; from uwblite.cli.child import Child; child = Child(sys.argv[1:]); print(flush=True); input()"
 
@@ -32,3 +36,15 @@ def test_a_command_ends_with_a_parent_that_was_killed(tmp_path):
         until(True, port)
         parent.kill()
     until(False, port)
+
+
+def test_a_command_that_does_not_end_when_asked_is_killed(monkeypatch):
+    """It is over, and waited for, when `stop` returns."""
+    monkeypatch.setattr(child_module, "_ENDING", 0.01)
+    usual = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        stuck = Child(["watch", "run.log"])
+    finally:
+        signal.signal(signal.SIGTERM, usual)
+    stuck.stop()
+    assert stuck.code() == -signal.SIGKILL

@@ -7,6 +7,7 @@ import pytest
 
 from uwblite.cli import main
 from uwblite.io.carmen import read_log
+from uwblite.io.formats import read_graph
 from uwblite.io.tum import read_tum
 
 
@@ -103,6 +104,15 @@ def test_a_graph_is_optimised_and_written_in_both_formats(tmp_path, capsys):
     assert main(["optimize", str(graph), "--kernel", "hubert"]) == 1
     assert main(["optimize", str(graph), "--set", "max_iteration=3"]) == 1
     assert "did you mean 'max_iterations'" in capsys.readouterr().err
+
+
+def test_a_converted_graph_keeps_its_places(tmp_path):
+    """Those of the file, which the edges contradict."""
+    (tmp_path / "graph.g2o").write_text(G2O)
+    assert main(["convert", str(tmp_path / "graph.g2o"), str(tmp_path / "out.pyfg")]) == 0
+    one, other = (read_graph(str(tmp_path / name)).graph for name in ("graph.g2o", "out.pyfg"))
+    assert np.abs(one.edges[0].residuals(one)).max() > 0.1
+    np.testing.assert_allclose(other.poses, one.poses)
 
 
 def test_an_anchor_without_a_position_is_found_from_its_ranges(tmp_path, capsys):

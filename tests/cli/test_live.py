@@ -67,6 +67,13 @@ def test_a_pose_that_is_not_known_is_null():
     assert json.loads(line_of(known))["pose"] == [1.0, 2.0, 0.5]
 
 
+def test_ages_are_said_to_a_tenth_of_a_second():
+    none = np.zeros(3)
+    state = LocalizerState(1.0, none, np.eye(3), 1.0, none, False, age=0.123, silent={"lidar": 6.04})
+    said = json.loads(line_of(state))
+    assert (said["age"], said["silent"]) == (0.1, {"lidar": 6.0})
+
+
 @pytest.fixture
 def circle(tmp_path):
     """A map of the emulated room, and the devices of a robot that drives a circle in it."""

@@ -197,6 +197,15 @@ def test_numbers_that_begin_with_a_minus_need_no_equals_sign(verb, capsys):
     assert "expected one argument" not in capsys.readouterr().err
 
 
+PLAN = {"--map": "map", "--from": "0,0", "--to": "1,1", "--radius": "0.2"}
+
+
+@pytest.mark.parametrize("missing", PLAN)
+def test_a_plan_needs_a_map_both_ends_and_a_radius(missing, capsys):
+    assert main(["plan", *(word for pair in PLAN.items() if pair[0] != missing for word in pair)]) == 2
+    assert f"the following arguments are required: {missing}" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "output"),
     [

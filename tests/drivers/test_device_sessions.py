@@ -13,9 +13,9 @@ from emulators.world import Epoch, Scan, WorldClock
 from helpers.driver_harness import of_kind, simulate
 
 from uwblite.drivers.dwm1001_driver import Dwm1001Driver
-from uwblite.drivers.events import Corrupt, LaserScan, Lost, Note, Param, RangeEpoch, SetBaud
+from uwblite.drivers.events import Corrupt, LaserScan, Lost, Note, Param, RangeEpoch, Reopen, Send, SetBaud
 from uwblite.drivers.scip import Reply
-from uwblite.drivers.scip_commands import Geometry, ScanRequest
+from uwblite.drivers.scip_commands import BAUD_RATES, Geometry, ScanRequest
 from uwblite.drivers.scip_driver import ScipDriver
 from uwblite.drivers.session import Session
 
@@ -158,6 +158,18 @@ def test_lidar_that_is_silent_asks_for_the_port_to_be_opened_again():
     assert reopens >= 1
     assert "lidar-silent" in names(actions)
     assert {a.rate for a in of_kind(actions, SetBaud)} == {19200, 57600, 250000, 500000, 750000}
+
+
+def test_a_lidar_at_the_last_bit_rate_is_asked_twice_at_each():
+    """The second time behind the end of a line: half a command of another program may stand there."""
+    driver, asked = ScipDriver(), []
+    session, now = Session(driver), START
+    actions = session.start(now)
+    while not any(isinstance(action, Reopen) for action in actions):
+        asked += [action.data for action in actions if isinstance(action, Send)]
+        now += 0.05
+        actions = session.tick(now)
+    assert asked == [b"QT\n", b"\n", b"QT\n"] * len(BAUD_RATES)
 
 
 def test_lidar_with_scip_1_only_is_named():

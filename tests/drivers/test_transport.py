@@ -1,9 +1,15 @@
-"""Ports that do not open: the words that say how to mend that."""
+"""Ports: those that do not open say how to mend that, those that do are held alone and hold up nobody."""
+
+import os
+from contextlib import closing
 
 import pytest
 
 from uwblite.drivers import transport
-from uwblite.drivers.transport import _explain
+from uwblite.drivers.devices import open_device
+from uwblite.drivers.link import Link
+from uwblite.drivers.transport import _explain, open_port
+from uwblite.errors import DeviceError
 
 
 @pytest.mark.parametrize(("url", "error", "words"), [
@@ -36,3 +42,37 @@ def test_a_port_that_is_not_there_names_those_that_are(tmp_path, monkeypatch):
         (tmp_path / name).touch()
     monkeypatch.setattr(transport, "BY_ID", tmp_path)
     assert _explain(f"{tmp_path}/ttyUSB7", OSError("no such file")).endswith(f"in {tmp_path} there are: usb-a, usb-b")
+
+
+@pytest.fixture
+def line():
+    """The device's end of a serial line, and the name of ours."""
+    device, ours = os.openpty()
+    name = os.ttyname(ours)
+    os.close(ours)
+    yield device, name
+    os.close(device)
+
+
+def test_a_port_is_open_once(line):
+    port = open_port(line[1], 115200)
+    with pytest.raises(DeviceError, match="another program has it open"):
+        open_port(line[1], 115200)
+    port.close()
+    open_port(line[1], 115200).close()
+
+
+def test_a_device_that_takes_no_bytes_does_not_hold_up_the_others(line):
+    """Nobody reads at its end: what is sent is refused once the line is full, not waited for."""
+    with closing(open_port(line[1], 115200)) as port, pytest.raises(DeviceError, match="takes no bytes"):
+        port.write(bytes(1 << 20))
+
+
+@pytest.mark.parametrize("end", [lambda link: link.disconnect(1.0), Link.finish])
+def test_a_link_that_ends_leaves_the_port_to_others(line, end):
+    session, _ = open_device("lidar", line[1])
+    link = Link("lidar", line[1], session)
+    port = link.port = open_port(line[1], 115200)
+    end(link)
+    assert link.port is None
+    open_port(port.url, 115200).close()

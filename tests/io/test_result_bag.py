@@ -117,6 +117,19 @@ def test_the_graph_carries_the_scan_of_each_keyframe(mapped, tmp_path):
     assert write_graph_with_scans(tmp_path / "y.g2o", result, []) == 0
 
 
+def test_how_many_keyframes_have_a_scan_is_said(mapped, tmp_path, capsys):
+    from uwblite.cli import main
+
+    result, _ = mapped
+    words = ["convert", str(result.folder), str(tmp_path / "x.g2o")]
+    many = len(result.keyframe_stamps)
+    assert main([*words, "--recording", str(result.folder.parent / "run.log.gz")]) == 0
+    assert main([*words, "--force"]) == 0
+    first, second = (line for line in capsys.readouterr().out.splitlines() if "with a scan" in line)
+    assert f"{many} poses, {many} poses with a scan" in first
+    assert f"{many} poses, 0 poses with a scan" in second
+
+
 def test_trajectories_go_where_evo_reads_them(mapped, tmp_path, capsys):
     from uwblite.cli import main
     from uwblite.io.tum import read_tum

@@ -197,6 +197,15 @@ def test_points_match_by_chance_in_clutter_and_hardly_in_a_room(room):
     assert shares[1] > shares[0] + 0.1
 
 
+def test_what_never_matched_by_chance_has_the_share_of_the_rule_of_succession(room):
+    """One match of three is known beforehand; then none of so many points, laid at four places."""
+    truth, clouds = room
+    one, far = np.array([0]), se2.between(truth[:1], truth[1:]) + np.array([50.0, 0.0, 0.0])
+    pairs = pairs_of(clouds, one, one + 1)
+    shares = matched_by_chance(rasterize(clouds, 0.1, 0.5), pairs, far)
+    assert shares.tolist() == pytest.approx([1.0 / (4.0 * np.sum(pairs.points >= 0) + 3.0), 1.0 / 3.0])
+
+
 def test_of_placements_called_right_with_a_probability_that_share_is_right():
     """Pairs of a walk through a hall, a fifth of them with wheels that slipped by half a metre."""
     truth, _, clouds = walked(7, HALL, 60.0)

@@ -297,7 +297,7 @@ CALIBRATION = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
 INDEX = CALIBRATION.index("heading_scale")
 
 
-def found(scale, *, missed=(), frozen=(), seed=0, turned_round=False, same_way=1):
+def found(scale, *, missed=(), frozen=(), seed=0, turned_round=False, same_way=1, calibration=CALIBRATION):
     """Compare wheels whose turns are to be multiplied by 1 + scale (number or one per step) with exact scans.
 
     missed, frozen : steps of which the wheels count no turn, or nothing. turned_round : every other edge measures i from j.
@@ -310,7 +310,7 @@ def found(scale, *, missed=(), frozen=(), seed=0, turned_round=False, same_way=1
     for k, step in enumerate(motion):
         truth[k + 1] = se2.compose(truth[k], step)
     wheels = chained(truth, np.full(3, NOISE_OF_TURNS))
-    object.__setattr__(wheels, "calibration", odometry_indices(CALIBRATION, STEPS))
+    object.__setattr__(wheels, "calibration", odometry_indices(calibration, STEPS))
     wheels.motion[:, 2] = wheels.motion[:, 2] / (1.0 + scale) + NOISE_OF_TURNS * rng.standard_normal(STEPS)
     wheels.motion[list(missed), 2] = 0.0
     wheels.motion[list(frozen)] = 0.0
@@ -318,8 +318,8 @@ def found(scale, *, missed=(), frozen=(), seed=0, turned_round=False, same_way=1
     if turned_round:
         i, j = np.where(i % 2, j, i), np.where(i % 2, i, j)
     none = np.zeros((STEPS, 3))
-    seen = ScanEdges(i, j, se2.between(truth[i], truth[j]), none[:, None] + np.eye(3), none, none, indices(CALIBRATION, *LASER))
-    return turn_scales(wheels, seen, Graph(truth, calibration=CALIBRATION))[INDEX]
+    seen = ScanEdges(i, j, se2.between(truth[i], truth[j]), none[:, None] + np.eye(3), none, none, indices(calibration, *LASER))
+    return turn_scales(wheels, seen, Graph(truth, calibration=calibration))[calibration.index("heading_scale")]
 
 
 @pytest.mark.parametrize("scale", [-0.3, 0.0, 0.1, 0.8])
@@ -331,6 +331,13 @@ def test_a_constant_scale_is_recovered(scale, turned_round):
         assert one.sigma < 0.02 * (1.0 + scale) ** 2
         assert not one.contradicts(scale)
         assert one.contradicts(scale + 0.2)
+
+
+def test_a_scale_alone_in_the_calibration_is_recovered():
+    alone = block([u for u in unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)) if u.key.kind == "heading_scale"])
+    assert len(alone.values) == 1
+    one = found(0.1, calibration=alone)
+    assert abs(one.value - 0.1) < 4.0 * one.sigma
 
 
 def test_turns_the_other_way_have_a_scale_of_minus_two():

@@ -58,7 +58,7 @@ class WindowLook:
     """s."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Window:
     """Measurements of the last metres, the oldest first (mutable)."""
 

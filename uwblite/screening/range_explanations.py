@@ -55,7 +55,7 @@ class PathPolicy:
     """Added to normal equations: a robot that stands shows a distance only."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Trace:
     """Readings of one anchor by one tag, apart by the way."""
 
