@@ -139,7 +139,7 @@ def _names(letter: str, names: Sequence[str], count: int, letters: bytes) -> NDA
 def _lines(
     graph: Graph, plain: dict[str, graph_file.Measured], stamps: Floats, poses: NDArray[np.str_], anchors: NDArray[np.str_]
 ) -> Iterator[str]:
-    """Yield the lines of each tag."""
+    """Yield the lines of the vertices, then those of each kind of edges."""
     first = int(np.argmax(graph.fixed_poses)) if len(graph.poses) else 0
     placed = np.isfinite(graph.anchors).all(axis=1)
     yield graph_file.rows_of("VERTEX_SE2", " %.6f %s", [stamps, poses], graph.poses)

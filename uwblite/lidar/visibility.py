@@ -244,10 +244,11 @@ def directional_overlap(raster: CloudRasters, i: Ints, j: Ints, T_i_j: Floats, g
 def net_overlap(
     raster: CloudRasters, free: Sequence[FreeSpace] | None, i: Ints, j: Ints, T_i_j: Floats, gate: float
 ) -> Floats:
-    """Return the net matching points (e,) of clouds i and j (e,) at relative poses (e, 3), counted both ways.
+    """Return the net matching points (e,) of clouds i and j (e,) at relative poses (e, 3), in the direction that has fewest.
 
     Of two stretches of a recording, the share of all points that match shows how long they overlap, not whether the place is
     right. Each point with a match counts for the place, each in view without a match against it, and others do not count.
+    Points of both clouds count, each by the square of its normal's part in a direction: long walls alone leave one without.
 
     Parameters
     ----------

@@ -186,61 +186,69 @@ def _without(edges: RangeEdges, anchors: list[int]) -> RangeEdges:
 def place_chains(graph: Graph, chains: Ints) -> list[Graph]:
     """Return graphs with every chain placed, the likeliest first; see starts."""
     hypotheses = [(0.0, graph)]
-    waiting, here = set(chains.tolist()) - {0}, chains == 0
+    waiting, placed = set(chains.tolist()) - {0}, chains == 0
     while waiting:
-        anchors = [_measured_from(g, here) for _, g in hypotheses]
-        chain = max(sorted(waiting), key=lambda c: len(_ties(hypotheses[0][1], anchors[0], chains == c, here)[2]))
-        mine = chains == chain
+        anchors = [_measured_from(g, placed) for _, g in hypotheses]
+        chain = max(sorted(waiting), key=lambda c: len(_ties(hypotheses[0][1], anchors[0], chains == c, placed)[2]))
+        of_chain = chains == chain
         found = [
-            (cost + more, replace(g, poses=np.where(mine[:, None], se2.compose(T, g.poses), g.poses)))
-            for (cost, g), there in zip(hypotheses, anchors, strict=True)
-            for more, T in _places(*_ties(g, there, mine, here))
+            (cost + more, replace(g, poses=np.where(of_chain[:, None], se2.compose(T, g.poses), g.poses)))
+            for (cost, g), in_map in zip(hypotheses, anchors, strict=True)
+            for more, T in _places(*_ties(g, in_map, of_chain, placed))
         ]
         hypotheses = sorted(found, key=lambda h: h[0])[: EvidencePolicy.searched]
         waiting.remove(chain)
-        here = here | mine
+        placed = placed | of_chain
     return [g for _, g in hypotheses]
 
 
-def _ties(graph: Graph, anchors: Floats, mine: Bools, here: Bools) -> tuple[Floats, Floats, Floats]:
-    """Return placed points (r, 2), points (r, 2) of a chain in its own frame, and the ranges (r,) between them; anchors (a, 2)
-    as measured from the poses that are placed (here), nan: none, and from those of the chain (mine)."""
-    there, own, ranges = [np.zeros((0, 2))], [np.zeros((0, 2))], [np.zeros(0)]
+def _ties(graph: Graph, anchors: Floats, of_chain: Bools, placed: Bools) -> tuple[Floats, Floats, Floats]:
+    """Return the distances by which a chain is tied to what is placed: points (r, 2) in the map, points (r, 2) in the chain's
+    own frame, and how far apart these are (r,), m.
+
+    Parameters
+    ----------
+    anchors : (a, 2) places in the map; nan = none. of_chain, placed : (n,) poses of the chain, and those placed in the map.
+    """
+    in_map, in_chain, distances = [np.zeros((0, 2))], [np.zeros((0, 2))], [np.zeros(0)]
     for e in graph.edges:
         if isinstance(e, PointDistanceEdges):
             for one, other in ((e.i, e.j), (e.j, e.i)):
-                tied = mine[one] & here[other]
-                own.append(graph.poses[one[tied], :2])
-                there.append(graph.poses[other[tied], :2])
-                ranges.append(e.distance[tied])
+                tied = of_chain[one] & placed[other]
+                in_chain.append(graph.poses[one[tied], :2])
+                in_map.append(graph.poses[other[tied], :2])
+                distances.append(e.distance[tied])
         elif isinstance(e, RangeEdges | LandmarkEdges):
-            tied = mine[e.pose] & np.isfinite(anchors[e.anchor]).all(axis=1)
-            there.append(anchors[e.anchor[tied]])
+            tied = of_chain[e.pose] & np.isfinite(anchors[e.anchor]).all(axis=1)
+            in_map.append(anchors[e.anchor[tied]])
             if isinstance(e, RangeEdges):
-                own.append(graph.poses[e.pose[tied], :2])
-                ranges.append(e.ranges[tied])
+                in_chain.append(graph.poses[e.pose[tied], :2])
+                distances.append(e.ranges[tied])
             else:
-                own.append(se2.transform(graph.poses[e.pose[tied]], e.position[tied]))
-                ranges.append(np.zeros(int(tied.sum())))
-    every = max(-(-sum(map(len, ranges)) // _MOST_RANGES), 1)
-    return np.concatenate(there)[::every], np.concatenate(own)[::every], np.concatenate(ranges)[::every]
+                in_chain.append(se2.transform(graph.poses[e.pose[tied]], e.position[tied]))
+                distances.append(np.zeros(int(tied.sum())))
+    every = max(-(-sum(map(len, distances)) // _MOST_RANGES), 1)
+    return np.concatenate(in_map)[::every], np.concatenate(in_chain)[::every], np.concatenate(distances)[::every]
 
 
-def _measured_from(graph: Graph, here: Bools) -> Floats:
-    """Return the anchors (a, 2), m, as placed by edges from some of the poses; nan where there are none."""
+def _measured_from(graph: Graph, poses: Bools) -> Floats:
+    """Return the anchors (a, 2), m, as placed by edges from some of the poses (n,); nan where there are none."""
     kinds = (e for e in graph.edges if isinstance(e, RangeEdges | LandmarkEdges))
-    found, lost = place_anchors(replace(graph, edges=tuple(e.rows(np.flatnonzero(here[e.pose])) for e in kinds)))
+    found, lost = place_anchors(replace(graph, edges=tuple(e.rows(np.flatnonzero(poses[e.pose])) for e in kinds)))
     anchors = found.anchors.copy()
     anchors[list(lost)] = np.nan
     return anchors
 
 
-def _places(there: Floats, own: Floats, ranges: Floats) -> list[tuple[float, Floats]]:
-    """Return (robust cost, T_map_chain) of the best places, apart from each other."""
-    if len(ranges) < _LEAST_RANGES:
+def _places(in_map: Floats, in_chain: Floats, distances: Floats) -> list[tuple[float, Floats]]:
+    """Return (robust cost, T_map_chain) of the best places of a chain, apart from each other, by its ties (see _ties).
+
+    Too few leave it where its own frame is.
+    """
+    if len(distances) < _LEAST_RANGES:
         return [(0.0, np.zeros(se2.POSE))]
     best: list[tuple[float, Floats]] = []
-    for cost, motion, _ in path_placements(there, own, ranges, np.full(len(ranges), 1.0 / _CHAIN_SIGMA)):
+    for cost, motion, _ in path_placements(in_map, in_chain, distances, np.full(len(distances), 1.0 / _CHAIN_SIGMA)):
         if all(np.abs(se2.between(motion, other)).max() > _APART for _, other in best):
             best.append((cost, motion))
     return best[: EvidencePolicy.searched]

@@ -127,9 +127,9 @@ def _jump(stamps: Floats, end: float) -> tuple[float, float] | None:
 
 
 def within_odometry(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
-    """Leave out scans outside the odometry's time; report how many, and how many ranges.
+    """Leave out scans outside the odometry's time where they are more than a few; note how many, and how many ranges.
 
-    Ranges outside it stay in the recording; a map gives them no weight.
+    Ranges outside it stay in the recording, as few scans do; a map gives them no weight.
     """
     first, last = log.odometry.stamps[[0, -1]]
     facts = []
