@@ -78,11 +78,11 @@ def test_lines_are_bresenhams_in_every_direction(reach):
         cols = np.arange(-reach, reach + 1)
         marks = np.zeros((len(cols), size, size), np.uint8)
         start = np.arange(len(cols)) * size * size + reach * size + reach
-        mark_rays(marks.reshape(-1), start, np.full(len(cols), row), cols, size, 9)
+        mark_rays(marks.reshape(-1), start, np.full(len(cols), row), cols, size)
         for slot, col in enumerate(cols):
             expected = np.zeros((size, size), np.uint8)
             for r, c in bresenham(reach, reach, reach + row, reach + int(col)):
-                expected[r, c] = 9
+                expected[r, c] = 1
             np.testing.assert_array_equal(marks[slot], expected)
 
 
@@ -92,7 +92,7 @@ def test_long_lines_round_exactly():
         d = np.unique(np.concatenate([[0, 1, n // 2, n - 1, n], rng.integers(0, n, 3)]))
         marks = np.zeros((n + 1) * (n + 1), np.uint8)
         for shorter in d:
-            mark_rays(marks, np.array([0]), np.array([shorter]), np.array([n]), n + 1, 1)
+            mark_rays(marks, np.array([0]), np.array([shorter]), np.array([n]), n + 1)
             k = np.arange(n)
             expected = (2 * k * int(shorter) + n) // (2 * n) * (n + 1) + k
             assert marks[expected].all()
@@ -387,13 +387,13 @@ def test_scan_by_scan_insertion_makes_the_same_map():
 
 def test_log_odds_are_bayes():
     config = GridConfig(p_hit=0.7, p_miss=0.4, clamp=100.0)
-    counter = RayCounter(geometry_of(5), 0.25)
-    counter.hits[1, 1], counter.misses[1, 1] = 3, 7 * WEIGHT_UNIT
     odds = (0.7 / 0.3) ** 3 * (0.4 / 0.6) ** 7
-    grid = from_counts(counter, config)
-    assert grid.probability()[1, 1] == pytest.approx(odds / (1 + odds), rel=1e-5)
-    assert grid.log_odds[0, 0] == 0.0
-    assert np.abs(from_counts(counter, GridConfig(clamp=0.1)).log_odds).max() == pytest.approx(0.1)
+    for chosen, expected in ((config, odds), (replace(config, clamp=0.1), math.exp(np.clip(math.log(odds), -0.1, 0.1)))):
+        counter = RayCounter(geometry_of(5), 0.25)
+        counter.hits[1, 1], counter.misses[1, 1] = 3, 7 * WEIGHT_UNIT
+        grid = from_counts(counter, chosen)
+        assert grid.probability()[1, 1] == pytest.approx(expected / (1 + expected), rel=1e-5)
+        assert grid.log_odds[0, 0] == 0.0
 
 
 @pytest.mark.parametrize("backwards", [False, True])

@@ -70,7 +70,7 @@ def test_odds_are_of_the_ranges_that_agree_and_of_scans_with_enough_ends():
 
 def test_a_rival_that_may_be_right_leaves_the_place_open():
     for rival, one in ((-20.0, True), (-5.0, False)):
-        assert (undecided(a_bank(rival), 0, True) == "") is one
+        assert (undecided(a_bank(rival), True) == "") is one
 
 
 def test_many_places_that_are_each_unlikely_are_together_as_likely_as_one():
@@ -80,13 +80,13 @@ def test_many_places_that_are_each_unlikely_are_together_as_likely_as_one():
         poses[1:, 0] = 3.0 * np.arange(1, 1 + many)
         bank = hypotheses.started(poses, np.tile(0.001 * np.eye(3), (1 + many, 1, 1)), np.zeros(0))
         weights = np.append(0.0, np.full(many, -CERTAIN - 2.0))
-        assert (undecided(hypotheses.reweighted(bank, weights), 0, True) == "") is one
+        assert (undecided(hypotheses.reweighted(bank, weights), True) == "") is one
 
 
 def test_a_search_that_left_places_out_decides_nothing_and_a_pose_that_is_not_sure_is_the_only_one_all_the_same():
-    assert "too many" in undecided(a_bank(), 0, False)
+    assert "too many" in undecided(a_bank(), False)
     wide = hypotheses.started(np.zeros((1, 3)), np.diag([0.1, 0.001, 0.001])[None], np.zeros(0))
-    assert undecided(wide, 0, True) == ""
+    assert undecided(wide, True) == ""
     assert "not sure" in imprecise(wide.pose_covariances[0])
 
 

@@ -98,9 +98,9 @@ class OccupancyGrid:
         return self.geometry.centre_of(row.astype(np.intp), col.astype(np.intp))
 
 
-def from_counts(counter: RayCounter, config: GridConfig, *, spent: bool = False) -> OccupancyGrid:
-    """Return the map that counted hits and misses make: additive log-odds, clamped; spent: in the memory of the misses."""
-    log_odds = counter.misses.view(np.float32) if spent else np.zeros(counter.hits.shape, dtype=np.float32)
+def from_counts(counter: RayCounter, config: GridConfig) -> OccupancyGrid:
+    """Return the map that counted hits and misses make: additive log-odds, clamped, in the memory of the misses."""
+    log_odds = counter.misses.view(np.float32)
     for rows in counter.geometry.strips():
         np.copyto(log_odds[rows], _log_odds(counter, rows, config), where=counter.seen(rows), casting="same_kind")
     return OccupancyGrid(counter.geometry, log_odds)

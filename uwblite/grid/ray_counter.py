@@ -107,7 +107,7 @@ class RayCounter:
         marks[:] = 0
         start = (np.arange(len(low)) * window - low[:, 0] * width - low[:, 1]).take(slot) + cells[0] * width + cells[1]
         rows, cols = cells[2:] - cells[:2]
-        mark_rays(marks, start, rows, cols, width, 1, None if walls is None else self._windows_of(walls, low, height, width))
+        mark_rays(marks, start, rows, cols, width, None if walls is None else self._windows_of(walls, low, height, width))
         if walls is None:
             marks[start + rows * width + cols] = _HIT
         first = low.min(axis=0)
@@ -174,9 +174,9 @@ _HALF = 0.5 + 1e-7
 
 
 def mark_rays(
-    marks: NDArray[np.uint8], start: Ints, d_row: Ints, d_col: Ints, stride: int, value: int, walls: Bools | None = None
+    marks: NDArray[np.uint8], start: Ints, d_row: Ints, d_col: Ints, stride: int, walls: Bools | None = None
 ) -> None:
-    """Write a value into every cell of the rays, first cell included, last cell excluded.
+    """Mark every cell of the rays with 1, first cell included, last cell excluded.
 
     Parameters
     ----------
@@ -212,6 +212,6 @@ def mark_rays(
             here[stopped] += last * across[stopped] - along[stopped]
             along[stopped] = across[stopped] = 0
             cell[stopped] = here[stopped]
-        marks[cell[:r]] = value
+        marks[cell[:r]] = 1
         moved[:r] += slope[:r]
         here[:r] += along[:r]

@@ -142,7 +142,7 @@ def from_sweeps(
     trace(counter, None, 0)
     if clears:
         trace(counter, walls_of(counter, config), count)
-    drawn = from_counts(counter if geometry else counter.cropped(), config, spent=True)
+    drawn = from_counts(counter if geometry else counter.cropped(), config)
     del counter  # Its hits take half as much memory as the map.
     missing = missing_share(recordings, drawn, config.max_clear_distance) if clears else math.nan
     return replace(drawn, scans_used=count, scans_astray=chosen - count, missing_share=missing)

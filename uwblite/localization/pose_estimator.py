@@ -250,11 +250,11 @@ class PoseEstimator:
         # Several poses that were tried may have moved to one place, which counts once.
         self._bank = hypotheses.pruned(found.hypotheses, _MOST, _FORGET)
         ranges, pose = found.ranges, self._bank.poses[0].copy()
-        alone = found.complete and verdict.odds_of_place(self._bank, 0) > verdict.LIKELY
+        alone = found.complete and verdict.odds_of_place(self._bank) > verdict.LIKELY
         agreed = self._agreed(pose if alone else None)
         odds = verdict.map_odds(float(found.scans[best]), float(found.known[best]), pose, ranges, agreed, self._tracked)
         self._reason = (
-            verdict.undecided(self._bank, 0, found.complete)
+            verdict.undecided(self._bank, found.complete)
             or verdict.imprecise(self._bank.pose_covariances[0])
             or odds.nowhere
             or verdict.other_unit(self.known.walls, pose, found.rays, found.independent, ranges)

@@ -33,18 +33,18 @@ SURE = 4.0
 """Standard deviations from which an error is certain, and a range disagrees."""
 
 
-def odds_of_place(bank: Hypotheses, best: int) -> float:
-    """Return the log-odds of the best place against all others together."""
-    return -float(np.logaddexp.reduce(bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)], initial=-np.inf))
+def odds_of_place(bank: Hypotheses) -> float:
+    """Return the log-odds of the first place, the likeliest, against all others together."""
+    return -float(np.logaddexp.reduce(bank.log_weight[hypotheses.apart(bank.poses[0], bank.poses)], initial=-np.inf))
 
 
-def undecided(bank: Hypotheses, best: int, complete: bool) -> str:
-    """Return why another place than the best one may be right; "" = none may."""
+def undecided(bank: Hypotheses, complete: bool) -> str:
+    """Return why another place than the first, the likeliest, may be right; "" = none may. complete : no place was left out."""
     if not complete:
         return "too many places are as likely; drive on"
-    if odds_of_place(bank, best) > CERTAIN:
+    if odds_of_place(bank) > CERTAIN:
         return ""
-    count = int((bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)] > -CERTAIN).sum())
+    count = int((bank.log_weight[hypotheses.apart(bank.poses[0], bank.poses)] > -CERTAIN).sum())
     return f"{1 + max(count, 1)} places are as likely; drive on, around a corner or past another anchor"
 
 
