@@ -8,48 +8,61 @@ import pytest
 from helpers.laser_walks import HALL, scanned
 
 from uwblite import se2
+from uwblite.lidar.cloud_rasters import rasterize
+from uwblite.lidar.clouds import CloudConfig
 from uwblite.lidar.correlative_matching import CorrelativeConfig
+from uwblite.lidar.scan_matching import Aligned, PairPolicy, match, pairs_of
+from uwblite.lidar.visibility import free_around, net_overlap, violates_free_space
 from uwblite.loop_closure import matching
 from uwblite.loop_closure.candidates import Candidates
 from uwblite.loop_closure.closures import LoopClosureConfig
 
 
-def test_free_space_is_asked_with_the_points_of_both_sub_maps(monkeypatch):
-    clouds = scanned(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.3], [2.0, 0.0, 0.6]]), HALL)
-    config, asked = LoopClosureConfig(), []
-
-    def violations(free_a, a, free_b, b, pose):
-        asked.append((free_a, free_b, pose))
-        np.testing.assert_array_equal(a, clouds.cloud("abc".index(free_a))[0])
-        np.testing.assert_array_equal(b, clouds.cloud("abc".index(free_b))[0])
-        return 0.25
-
-    monkeypatch.setattr(matching, "violates_free_space", violations)
-    least = min(config.overlap, config.overlap_after_search)
-    share, rms = np.array([least, least - 0.01, 1.0, 1.0]), np.array([config.sigma, 0.0, config.sigma * 1.01, 0.0])
-    candidates = SimpleNamespace(target=np.array([0, 0, 0, 1]), source=np.array([1, 1, 2, 2]))
-    best = SimpleNamespace(share=share, rms=rms, pose=["first", "few", "far", "last"])
-    promising = matching._promising(best, np.full(4, np.inf), config)
-    batch = SimpleNamespace(candidates=candidates, free=["a", "b", "c"], clouds=clouds)
-    assert matching._free_space_violations(batch, best, promising).tolist() == [0.25, 0.0, 0.0, 0.25]
-    assert asked == [("a", "b", "first"), ("b", "c", "last")]
-    batch.free = None
-    assert matching._free_space_violations(batch, best, promising).tolist() == [0.0] * 4
+def planted(truth, guess, spread=0.0, sigma=0.01, **options):
+    """Return a batch of sub-maps seen from poses (k, 3), each from the second on matched with the first from a guess (e, 3)."""
+    clouds, many = scanned(truth, HALL), len(truth) - 1
+    target, source = np.zeros(many, dtype=np.intp), np.arange(1, many + 1)
+    covariances = np.tile(np.eye(3) * sigma**2, (many, 1, 1))
+    candidates = Candidates(target, source, guess, covariances, np.full(many, spread), False, **options)
+    return matching._Batch(candidates, clouds, 0.5, None, LoopClosureConfig(), CorrelativeConfig())
 
 
-def test_stretches_are_compared_by_the_surface_that_speaks_for_a_place(monkeypatch):
+TRUTH = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.3], [2.0, 0.0, 0.6], [0.5, 0.8, -0.4]])
+STEPS = se2.between(TRUTH[:1], TRUTH[1:])
+
+
+def test_promising_matches_are_tested_against_the_free_space_of_both_sub_maps():
+    """The first is in its place, the second is not promising, the third is a metre off: through a wall."""
+    batch = planted(TRUTH, STEPS)
+    free = free_around(batch.clouds)
+    off = STEPS + np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+    best, promising = matched(batch, off), np.array([True, False, True])
+    through = matching._free_space_violations(replace(batch, free=free), best, promising)
+    points = [batch.clouds.cloud(k)[0] for k in range(len(TRUTH))]
+    expected = [violates_free_space(free[0], points[0], free[k], points[k], off[k - 1]) for k in (1, 2, 3)]
+    assert through.tolist() == [expected[0], 0.0, expected[2]]
+    assert expected[0] < 0.01
+    assert min(expected[1:]) > 0.05
+    assert matching._free_space_violations(batch, best, promising).tolist() == [0.0] * 3
+
+
+def matched(batch, poses):
+    """Return the matches of a batch's pairs at poses (e, 3)."""
+    raster, gate = rasterize(batch.clouds, CloudConfig.raster, PairPolicy.reach), batch.config.gate
+    pairs = pairs_of(batch.clouds, batch.candidates.target, batch.candidates.source)
+    return Aligned(poses, match(raster, pairs, poses, gate, gate / 2.0))
+
+
+def test_stretches_are_compared_by_the_surface_that_speaks_for_a_place():
     """Sub-maps by the share of all points."""
-    truth = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.3]])
-    clouds, config = scanned(truth, HALL), LoopClosureConfig()
-    ends, guess = np.array([0, 0]), np.tile(se2.between(truth[0], truth[1]), (2, 1))
-    stretches = Candidates(ends, ends + 1, guess, np.zeros((2, 3, 3)), np.ones(2), False, long=True)
-    monkeypatch.setattr(matching, "_guesses", lambda batch: (np.arange(2), guess))
-    monkeypatch.setattr(matching, "net_overlap", lambda *args: np.full(len(args[2]), 13.7))
-    for candidates, net in ((stretches, 13.7), (replace(stretches, long=False), np.inf)):
-        found, _ = matching._fit(matching._Batch(candidates, clouds, 1.0, None, config, CorrelativeConfig()))
-        assert found.net.tolist() == [net, net]
-        np.testing.assert_allclose(found.best.pose, guess, atol=1e-3)
+    batch = planted(TRUTH, STEPS, long=True)
+    for long in (True, False):
+        found, _ = matching._fit(replace(batch, candidates=replace(batch.candidates, long=long)))
+        np.testing.assert_allclose(found.best.pose, STEPS, atol=0.005)
         assert found.found.all()
+        raster, ends = rasterize(batch.clouds, CloudConfig.raster, PairPolicy.reach), (batch.candidates.target, [1, 2, 3])
+        net = batch.spacing * net_overlap(raster, None, *map(np.array, ends), STEPS, batch.config.gate)
+        np.testing.assert_allclose(found.net, net if long else np.inf, rtol=0.05)
 
 
 def test_of_a_wide_search_the_net_overlap_is_enough():
@@ -60,32 +73,22 @@ def test_of_a_wide_search_the_net_overlap_is_enough():
     assert matching._promising(best, net, config).tolist() == [True, False]
 
 
-def test_places_are_searched_as_far_as_they_are_uncertain(monkeypatch):
-    """In heading to three sigma, at least 0.1 rad and at most the limit; matching starts from guesses that are certain."""
-    config, asked, steps = LoopClosureConfig(), [], []
-
-    def search(target, source, guess, half_widths, settings):
-        asked.append((target, source, *half_widths))
-        steps.append((settings.resolution, settings.spread, settings.angle_step))
-        return SimpleNamespace(poses=np.tile(guess, (30, 1)))
-
-    monkeypatch.setattr(matching, "search", search)
-    monkeypatch.setattr(matching, "_window", lambda guess, half_width, turn, *_: (guess, (half_width, half_width, turn)))
-    spread, sigma = np.array([config.direct, 1.0, 2.0, 9.0]), np.array([1.0, 0.01, 0.1, 9.0])
-    candidates = SimpleNamespace(
-        spread=spread, covariance=np.eye(3) * sigma[:, None, None] ** 2, guess=np.arange(12.0).reshape(4, 3),
-        target=np.array([0, 1, 2, 3]), source=np.array([4, 5, 6, 7]),
-    )  # fmt: skip
-    numbers = SimpleNamespace(chosen=lambda which: int(which[0]))
-    fine, coarse = (0.15, 0.12, 0.03), pytest.approx((0.3, 0.24, 0.02))  # twice the cells, finer headings for long clouds
-    for candidates.long, places, step in ((False, config.places, fine), (True, matching.MatchingPolicy.many_places, coarse)):
-        asked.clear(), steps.clear()
-        rows, guesses = matching._guesses(matching._Batch(candidates, numbers, 0.1, None, config, CorrelativeConfig()))
-        wide = (3, 7, 9.0, 9.0, config.search_angle)
-        assert asked == [(1, 5, 1.0, 1.0, 0.1), (2, 6, 2.0, 2.0, pytest.approx(0.3)), wide]
-        assert steps == [step] * 3
-        assert rows.tolist() == [0] + [1] * places + [2] * places + [3] * places
-        np.testing.assert_array_equal(guesses, candidates.guess[rows])
+@pytest.mark.parametrize("long", [False, True])
+@pytest.mark.parametrize(("off", "sigma"), [((1.5, -1.2, 0.05), 0.001), ((-1.0, 1.8, 0.4), 0.15)])
+def test_places_are_searched_as_far_as_they_are_uncertain(off, sigma, long):
+    """In heading to three sigma, at least 0.1 rad; what is farther away is not found, and what is certain is not searched."""
+    guess = STEPS[:1] + np.array(off)
+    for spread, within in ((2.0, True), (1.0, False)):
+        rows, poses = matching._guesses(planted(TRUTH[:2], guess, spread, sigma, long=long))
+        assert len(rows) == len(poses) <= 30
+        away = np.abs(poses - guess)
+        assert np.all(away[:, :2] <= spread + 0.3)
+        assert np.all(away[:, 2] <= max(3.0 * sigma, 0.1) + 0.03)
+        near = np.abs(poses - STEPS[:1]) < [0.3, 0.3, 0.04]
+        assert near.all(axis=1).any() == within
+    rows, poses = matching._guesses(planted(TRUTH[:2], guess, LoopClosureConfig().direct, sigma, long=long))
+    assert rows.tolist() == [0]
+    np.testing.assert_array_equal(poses, guess)
 
 
 @pytest.mark.parametrize("guess", [(0.0, 0.0, 0.2), (35.0, -80.0, 1.0), (-4.0, 15.0, 0.0)])

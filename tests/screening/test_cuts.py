@@ -127,38 +127,34 @@ def test_scans_beside_a_time_show_one_place_or_another_or_nothing(before, after,
     assert cuts.same_place(log.without(lidar=True), start + 49.9, start + 50.1) is None
 
 
-@pytest.mark.parametrize(("share", "everywhere", "same"), [
-    (0.0, 1.0, None), (0.01, 1.0, False), (0.54, 1.0, False), (0.56, 0.49, None), (0.56, 0.5, True),
-])  # fmt: skip
-def test_two_scans_are_of_one_place_where_more_than_half_matches_in_every_direction(monkeypatch, share, everywhere, same):
-    """Too little that matches is another place; a smooth wall along which one may slide, and nothing at all, decide nothing."""
-    monkeypatch.setattr(cuts, "_matched", lambda *_: (np.zeros((1, 3)), np.array([share])))
-    monkeypatch.setattr(cuts, "directional_shares", lambda *_: np.array([everywhere]))
-    log = recording(two_rounds())
-    middle = log.odometry.stamps[0] + 50.0
-    assert cuts.same_place(log, middle - 1.0, middle + 1.0) is same
+def carried_unseen(log, which):
+    """Return a log some of whose scans, which (s,), are of a room that is smaller by half."""
+    scale = np.where(which[:, None], 0.5, 1.0).astype(np.float32)
+    return replace(log, scans=replace(log.scans, ranges=scale * log.scans.ranges))
+
+
+def test_two_scans_are_of_one_place_of_two_or_along_a_smooth_wall():
+    log, around = recording(two_rounds()), np.array([-0.1, 0.1])
+    times = log.odometry.stamps[0] + np.array([30.0, 50.0, 70.0])
+    assert all(cuts.same_place(log, *(time + around)) for time in times)
+    elsewhere = [cuts.same_place(carried_unseen(log, log.scans.stamps > time), *(time + around)) for time in times]
+    assert True not in elsewhere
+    assert False in elsewhere
+    for ahead in (0.0, 18.0):
+        assert cuts.same_place(tunnel(ahead), *(CUT + around)) is None
 
 
 @pytest.mark.parametrize(
-    ("scans", "beams", "jump", "asked"),
-    [
-        (20, 30, 8, [([8], [9]), ([7], [10])]), (20, 30, 1, [([1], [2]), ([0], [3])]),
-        (20, 30, 17, [([17], [18]), ([16], [19])]),
-        (20, 30, 0, []), (20, 30, 18, []), (19, 30, 8, []), (20, 29, 8, []),
-    ],
+    ("scans", "beams", "jump", "cut"),
+    [(20, 30, 8, True), (20, 30, 1, True), (20, 30, 17, True), (20, 30, 0, False), (20, 30, 18, False), (19, 30, 8, False),
+     (20, 29, 8, False)],
 )  # fmt: skip
-def test_a_cut_is_where_a_scan_and_those_beside_it_are_elsewhere(monkeypatch, scans, beams, jump, asked):
-    """A few scans or beams show none."""
-    readings = np.ones((scans, beams), dtype=np.float32)
-    readings[jump + 1 :] = 3.0
-    odometry = Odometry(np.arange(20.0), np.zeros((20, 3)))
-    log = SensorLog(odometry, None, LaserScans(np.arange(float(scans)), readings, 0.0, 0.1, 0.0, 0.1, 10.0))
-    pairs = []
-
-    def elsewhere(log, first, second):
-        pairs.append((first.tolist(), second.tolist()))
-        return np.ones(len(first), dtype=bool), np.full(len(first), 0.3)
-
-    monkeypatch.setattr(cuts, "_elsewhere", elsewhere)
-    assert cuts._by_lidar(log).tolist() == ([jump + 0.5] if asked else [])
-    assert pairs == asked
+def test_a_cut_is_where_a_scan_and_those_beside_it_are_elsewhere(scans, beams, jump, cut):
+    """A few scans or beams show none, nor does a change at either end, nor a scan that is wrong by itself."""
+    whole = recording(two_rounds())
+    number, every = np.arange(len(whole.scans.stamps)) - 250, whole.scans.ranges.shape[1] // beams
+    for wrong, found in ((number > jump, cut), (number == jump, False)):
+        few = carried_unseen(whole, wrong).scans.rows((number >= 0) & (number < scans))
+        few = replace(few, ranges=few.ranges[:, : every * beams : every], angle_increment=every * few.angle_increment)
+        times = cuts._by_lidar(replace(whole, scans=few))
+        assert times.tolist() == ([pytest.approx(few.middles[jump : jump + 2].mean())] if found else [])

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers import room_recording
 from helpers.planted import box, drive, odometry, recording, scans, wander
 from helpers.told import told
 
 from uwblite import se2
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.screening import directions
 from uwblite.screening.directions import heading_with_the_path, laser_ahead, laser_upright
 from uwblite.screening.wheel_motion import Pairs, compare
 from uwblite.sensor_log import Odometry, SensorLog, SensorMounting
@@ -37,27 +37,21 @@ def test_pairs_along_bare_walls_do_not_hide_the_direction_of_the_laser(angle, st
     assert abs(se2.wrap_angle(turned.mounting.T_base_laser[2] - angle)) < 0.1
 
 
-@pytest.mark.parametrize(("seen", "changed", "open_sign"), [
-    ({"heading": 1, "y": -1}, "the sign of its heading", False), ({"heading": -1, "y": 1}, "the sign of its y", False),
-    ({"heading": 0, "y": 0}, "the sign of its heading", True),
+@pytest.mark.parametrize(("signs", "lidar", "changed"), [
+    ((1.0, 1.0, -1.0), True, "the sign of its heading"), ((1.0, -1.0, 1.0), True, "the sign of its y"),
+    ((1.0, 1.0, -1.0), False, "the sign of its heading"),
 ])  # fmt: skip
-def test_a_heading_against_its_path_is_mended_as_the_laser_shows(monkeypatch, seen, changed, open_sign):
+def test_a_heading_against_its_path_is_mended_as_the_laser_shows(signs, lidar, changed):
     """The heading counts the wrong way, or y does; without a laser nothing shows which."""
-    stamps = 0.1 * np.arange(400)
-    odometry = Odometry(stamps, se2.chain(np.zeros(3), np.tile([0.05, 0.0, 0.02], (399, 1))) * [1.0, 1.0, -1.0])
-
-    def mended(log):
-        return "heading" if np.array_equal(log.odometry.poses[:, 1], odometry.poses[:, 1]) else "y"
-
-    monkeypatch.setattr(directions, "compare", mended)
-    monkeypatch.setattr(directions, "_turns_alike", seen.__getitem__)
-    done, facts = heading_with_the_path(SensorLog(odometry))
+    sound = room_recording.recording(room_recording.two_rounds()).without(lidar=not lidar)
+    wrong = replace(sound, odometry=Odometry(sound.odometry.stamps, sound.odometry.poses * signs))
+    done, facts = heading_with_the_path(wrong)
     (remark,) = told(facts)
-    sign = [1.0, 1.0, -1.0] if "heading" in changed else [1.0, -1.0, 1.0]
-    np.testing.assert_array_equal(done.odometry.poses, odometry.poses * sign)
+    np.testing.assert_array_equal(done.odometry.poses, sound.odometry.poses)
     assert (remark.kind, f"path: {changed} was inverted" in remark.text) == ("heading-against-path", True)
-    assert ("whether the map is mirrored" in remark.text) == open_sign
+    assert ("whether the map is mirrored" in remark.text) == (not lidar)
     assert heading_with_the_path(done) == (done, [])
+    assert heading_with_the_path(sound) == (sound, [])
 
 
 def test_directions_that_do_not_agree_leave_the_laser_as_given():
