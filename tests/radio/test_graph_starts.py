@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -18,7 +19,6 @@ from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
 from uwblite.io.graph_file import chained_poses
 from uwblite.io.pyfg import read_pyfg, write_pyfg
-from uwblite.radio import graph_starts
 from uwblite.radio.graph_starts import (
     Start,
     _places,
@@ -29,7 +29,6 @@ from uwblite.radio.graph_starts import (
     starts_nearby,
     straightened,
 )
-from uwblite.radio.trilateration import AnchorHypothesis, PathPlacement
 
 
 def test_an_anchor_of_two_ranges_has_a_place_only_where_one_is_given():
@@ -81,21 +80,18 @@ def test_anchors_far_away_are_put_where_their_ranges_cost_less():
 
 
 @pytest.mark.parametrize(("less", "put"), [(0.015, False), (0.025, True)])
-def test_another_place_must_cost_a_fiftieth_less(monkeypatch, less, put):
+def test_another_place_must_cost_a_fiftieth_less(less, put):
     """An anchor so far off that its ranges cost so much more there than where the search finds it."""
     graph, truth, where = loop(0, anchors=1)
-    at = replace(graph, poses=truth, anchors=where, edges=graph.edges[-1:])
-    least = at.chi2()
+    best = search_anchors(replace(graph, poses=truth, anchors=where + 50.0, edges=graph.edges[-1:]))
 
     def moved(x):
-        return replace(at, anchors=where + np.array([x, 0.0]))
+        return replace(best, anchors=best.anchors + np.array([x, 0.0]))
 
-    aside = brentq(lambda x: (1.0 - less) * moved(x).chi2() - least, 0.0, 1.0)
-    hypothesis = AnchorHypothesis(where[0], 0.0, 0.1, 0.0, 0.0)
-    monkeypatch.setattr(graph_starts, "trilaterate", lambda *_: [hypothesis])
+    aside = brentq(lambda x: (1.0 - less) * moved(x).chi2() - best.chi2(), 0.0, 1.0)
     found = search_anchors(moved(aside))
     assert (found is not None) == put
-    assert not put or np.array_equal(found.anchors, where)
+    assert not put or np.array_equal(found.anchors, best.anchors)
 
 
 def test_anchors_in_their_places_and_fixed_ones_stay():
@@ -243,11 +239,23 @@ def test_four_robots_of_tiers_from_their_odometry(shared_data, tmp_path):
     assert ate(found) <= 1.05 * ate(local)
 
 
-def test_the_best_places_of_a_chain_are_four_a_tenth_apart_the_cheapest_first(monkeypatch):
-    """By distance or by heading; of places nearer to each other than that only the cheapest counts."""
-    found = [(3.0, 0.0, 0.11), (1.0, 0.0, 0.0), (2.0, 0.09, 0.09), (9.0, 0.5, 0.0), (4.0, 0.12, 0.0), (5.0, 0.3, 0.0)]
-    ends = [PathPlacement(cost, np.array([x, 0.0, theta]), np.eye(3)) for cost, x, theta in sorted(found)]
-    monkeypatch.setattr(graph_starts, "path_placements", lambda *_: ends)
-    assert [cost for cost, _ in _places(np.zeros((4, 2)), np.zeros((4, 2)), np.ones(4))] == [1.0, 3.0, 4.0, 5.0]
-    ((cost, place),) = _places(np.zeros((3, 2)), np.zeros((3, 2)), np.ones(3))
+@pytest.mark.parametrize("straight", [True, False])
+def test_the_best_places_of_a_chain_are_few_and_apart_the_cheapest_first(straight):
+    """Of a straight path the mirror image about the line through two anchors is as good as the truth."""
+    rng = np.random.default_rng(2)
+    truth, along = np.array([2.0, 1.5, 0.7]), rng.uniform(0.0, 6.0, 80)
+    path = np.column_stack([along, np.zeros(80) if straight else np.sin(along) + 0.2 * along])
+    anchors = np.array([[0.0, 0.0], [8.0, 0.0]])[np.arange(80) % 2]
+    ranges = np.hypot(*(se2.transform(truth, path) - anchors).T) + rng.normal(0.0, 0.05, 80)
+    found = _places(anchors, path, ranges)
+    costs, places = [cost for cost, _ in found], [place for _, place in found]
+    assert costs == sorted(costs)
+    assert len(found) <= 4
+    assert all(np.abs(se2.between(a, b)).max() > 0.1 for a, b in combinations(places, 2))
+    mirrored = truth * [1.0, -1.0, -1.0]
+    right = [truth, mirrored][: 1 + straight]
+    for best in places[: len(right)]:
+        assert min(np.abs(se2.between(best, place)).max() for place in right) < 0.1
+    assert (costs[1] < 1.01 * costs[0]) is straight
+    ((cost, place),) = _places(anchors[:3], path[:3], ranges[:3])
     assert (cost, place.tolist()) == (0.0, [0.0] * 3)

@@ -173,7 +173,7 @@ def test_many_cells_in_one_pixel_equal_a_loop_over_blocks():
 
 def test_the_legend_is_of_what_is_drawn_and_never_cut():
     keys = [Key(text, PATHS[0], "line", 32) for text in ("path", "recording 2", "anchor, 2 sigma", "loop closure")]
-    for width in (240, 500, 2000):
+    for width in (240, 500, 2000, *range(600, 1200)):
         rows = rows_of(width, keys)
         assert [key for row in rows for key in row] == keys
         assert all(len(row) == 1 or sum(key.wide for key in row) <= width for row in rows)

@@ -8,6 +8,7 @@ from helpers.room_recording import recording, two_rounds
 from helpers.told import told
 
 from uwblite import se2
+from uwblite.findings import Fact
 from uwblite.screening import cuts
 from uwblite.screening.screen import screen
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog, UwbRanges
@@ -92,6 +93,25 @@ def test_scans_of_a_room_contradict_ranges_that_all_jump():
     log = replace(log, ranges=replace(log.ranges, ranges=log.ranges.ranges + 6.0 * late))
     assert len(cuts.found(log.without(lidar=True), np.zeros(0))) == 1
     assert len(cuts.found(log, np.zeros(0))) == 0
+
+
+@pytest.mark.parametrize(("away", "cut"), [(-3.5, True), (-2.5, False), (2.5, False), (3.5, True)])
+def test_cuts_near_other_breaks_are_those(away, cut):
+    """Three seconds before one or behind the next reading."""
+    log = wheels_go_on(tunnel(18.0), 18.0)
+    alone, _ = cuts.cuts(log, np.zeros(0), np.zeros(0))
+    assert alone.stamps.tolist() == [pytest.approx(CUT, abs=1.0)]
+    breaks, facts = cuts.cuts(log, np.zeros(0), cuts.found(log, np.zeros(0)) + np.array([-30.0, away]))
+    assert [r.severity for r in told(facts)] == ["doubt"] * cut
+    assert breaks.stamps.tolist() == alone.stamps.tolist() * cut
+    assert breaks.sigma.tolist() == [[20.0, 20.0, 3.0]] * cut
+
+
+def test_of_many_cuts_five_are_said():
+    times = [10.0, 47.0, 54.0, 100.0, 150.0, 200.0]
+    many, few = (told([Fact.of("carried", at=times[:count], silent=0.0)])[0].text for count in (6, 5))
+    assert "at t = 10, 47, 54, 100, 150 ... s the robot" in many
+    assert " ... " not in few
 
 
 def test_a_cut_is_the_moment_of_the_jump_that_is_nearest_to_it():

@@ -1,7 +1,6 @@
 """Contradictions within a recording are repaired where they can be, and reported in any case."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from helpers.told import told
 from uwblite import se2
 from uwblite.errors import DataError
 from uwblite.findings import Fact
-from uwblite.screening import clocks, cuts, repeats
+from uwblite.screening import clocks, cuts, repeats, wheel_motion
 from uwblite.screening import screen as screening
 from uwblite.screening.screen import screen
 from uwblite.se2 import chain as chained
@@ -474,37 +473,20 @@ def test_a_robot_that_drives_less_than_two_metres_is_a_doubt(path, said):
     assert all("1.99 m in 30 s (turning 7.0 rad)" in r.text for r in found)
 
 
-def test_cuts_near_other_breaks_are_those(monkeypatch):
-    """Three seconds before one or behind the next reading; of many five are said."""
-    stamps = np.arange(100.0, 400.0, 1.0)
-    log = SensorLog(Odometry(stamps, np.zeros((300, 3))))
-    times = np.array([110.5, 146.9, 147.1, 153.9, 154.1, 200.5, 250.5, 300.5])
-    monkeypatch.setattr(cuts, "found", lambda log, jumps: times)
-    breaks, facts = cuts.cuts(log, np.zeros(0), np.array([150.0]))
-    (remark,) = told(facts)
-    np.testing.assert_array_equal(breaks.stamps, [110.0, 146.0, 154.0, 200.0, 250.0, 300.0])
-    np.testing.assert_array_equal(breaks.sigma, [[20.0, 20.0, 3.0]] * 6)
-    assert remark.severity == "doubt"
-    assert "at t = 10, 47, 54, 100, 150 ... s the robot" in remark.text
-    times = times[:1]
-    assert " ... " not in told(cuts.cuts(log, np.zeros(0), np.zeros(0))[1])[0].text
-    times = times[:0]
-    assert cuts.cuts(log, np.zeros(0), np.zeros(0))[1] == []
-
-
-def test_wheels_that_stand_are_asked_of_ranges_where_no_scan_sees_it(monkeypatch, sound):
+def test_wheels_that_stand_are_asked_of_ranges_where_no_scan_sees_it():
     """The times are said since the beginning; each stretch that ranges contradict is a doubt of its own."""
-    stands = [(110.0, 120.0), (130.0, 137.5), (150.0, 160.0)]
-    monkeypatch.setattr(screening.wheel_motion, "standing", lambda odometry, least: stands)
-    monkeypatch.setattr(screening.wheel_motion, "lost", lambda log, pairs: [])
-    monkeypatch.setattr(screening.range_motion, "excess", lambda log, a, b: 0.5 if a < 140.0 else 0.0)
-    for pairs, said in ((SimpleNamespace(seen=lambda a, b: a == 110.0), ["30 to 38"]), (None, ["10 to 20", "30 to 38"])):
-        log, same, breaks, facts = screening._lost_wheels(sound, pairs)
+    path = two_rounds()
+    log = frozen(recording(np.concatenate([path[:200], np.tile(path[200], (200, 1)), path[200:]])), 126.0, 136.0)
+    log = frozen(log, 150.0, 160.0)
+    blind = replace(log, scans=log.scans.rows(log.scans.stamps < 124.0))
+    for seen, pairs in ((blind, wheel_motion.compare(blind)), (log.without(lidar=True), None)):
+        left, same, breaks, facts = screening._lost_wheels(seen, pairs)
         remarks = told(facts)
-        assert (log, same) == (sound, pairs)
-        assert [r.text.split("t = ")[1].split(" s")[0] for r in remarks] == said
+        assert (left, same) == (seen, pairs)
+        assert [r.text.split("t = ")[1].split(" s")[0] for r in remarks] == ["26 to 36", "50 to 60"]
         assert all(r.severity == "doubt" and "rests on ranges alone" in r.text for r in remarks)
-        assert len(breaks.stamps) == (4 if pairs else 9)
+        assert all(np.any((breaks.stamps > a) & (breaks.stamps < b)) for a, b in ((126.0, 136.0), (150.0, 160.0)))
+        assert np.all((breaks.stamps > 125.0) & (breaks.stamps < 160.0))
 
 
 def test_a_log_thinned_by_motion_has_no_gap_where_the_robot_stands(sound):

@@ -1,7 +1,13 @@
 """Wheels against lidar: where wheels stand, which pairs are compared, and what a sustained disagreement is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from helpers.laser_walks import CORRIDOR
+from helpers.planted import box, scans
+from helpers.room_recording import recording as room
+from helpers.room_recording import two_rounds
 from helpers.told import told
 
 from uwblite import se2
@@ -252,29 +258,34 @@ def test_the_factor_of_turns_is_of_turns_alone():
     assert disagreeing(found, 0.0) == []
 
 
-@pytest.mark.parametrize(("by_wheels", "said"), [(0.0004, False), (0.00047, False), (0.00049, True)])
-def test_a_motion_that_matches_hardly_better_than_that_of_the_wheels_is_none(monkeypatch, by_wheels, said):
-    """Along a bare wall, by mean square distances of matches, m^2; the lidar's own is 0.0004."""
-    found = pairs(100)
-    found.lidar[40:50, 0] = 0.5
-    scans = LaserScans(np.arange(150.0), np.ones((150, 20), dtype=np.float32), 0.0, 0.1, 0.0, 0.05, 8.0)
-    log = SensorLog(driven(np.full(150, 0.1), np.zeros(150), 1.0), None, scans)
-    by = iter([0.0004, by_wheels])
-    monkeypatch.setattr(wheel_motion, "misfits", lambda scans, mounting, first, second, motion: np.full(len(first), next(by)))
-    assert len(disagreeing(found, 0.0, log)) == said
+@pytest.mark.parametrize(("walls", "said"), [(CORRIDOR, False), (box(16.0, 5.0), True)])
+def test_a_motion_that_matches_hardly_better_than_that_of_the_wheels_is_none(walls, said):
+    """Along bare walls any does; in a room that of the lidar is the one."""
+    stamps = 0.1 * np.arange(600)
+    truth = np.column_stack([0.2 * stamps - 6.0, np.zeros((600, 2))])
+    seen = scans(stamps, truth, walls, noise=0.01, rng=np.random.default_rng(1))
+    wheels = truth - np.outer(np.clip(stamps - 20.0, 0.0, 15.0), [0.2, 0.0, 0.0])
+    found = compare(SensorLog(Odometry(stamps, truth), None, seen))
+    slow = SensorLog(Odometry(stamps, wheels), None, seen)
+    found.wheels[:] = slow.odometry.motion(found.start, found.end)
+    assert len(disagreeing(found, 0.0)) == 1
+    assert len(disagreeing(found, 0.0, slow)) == said
 
 
-@pytest.mark.parametrize(("moved", "rest", "stands"), [(0.007, 0.016, True), (0.007, 0.021, False), (0.02, 0.027, True)])
-def test_a_robot_at_rest_whose_scans_differ_by_noise_stands(monkeypatch, moved, rest, stands):
-    """Wheels stand for 4 s, and of few points some motion fits better than rest (rms distances of matches, m)."""
-    time = 0.1 * np.arange(150)
-    odometry = driven(np.where((time >= 4.95) & (time < 8.95), 0.0, 0.3), 0.0 * time)
-    compared = pairs(100, start=0.1 * np.arange(100), end=0.1 * np.arange(100) + 0.2)
-    stamps = 0.1 * np.arange(150)
-    log = SensorLog(odometry, None, LaserScans(stamps, np.ones((150, 20), dtype=np.float32), 0.0, 0.1, 0.0, 0.05, 8.0))
-    by = iter([moved**2, rest**2])
-    monkeypatch.setattr(wheel_motion, "misfits", lambda scans, mounting, first, second, motion: np.full(len(first), next(by)))
-    assert len(wheel_motion.lost(log, compared)) == (not stands)
+def test_a_robot_at_rest_whose_scans_differ_by_noise_stands():
+    """Its scans seem to move by a few centimetres; where the wheels stand while it drives they do move, and match so alone."""
+    path = two_rounds()
+    rests, drives = np.concatenate([path[:1000], np.tile(path[1000], (100, 1)), path[1000:2400]]), path[:2400]
+    for truth, found in ((rests, []), (drives, [(150.0, 155.0)])):
+        log = room(truth)
+        still = (log.odometry.stamps[1:] > 150.0) & (log.odometry.stamps[1:] <= 155.0)
+        steps = np.where(still[:, None], 0.0, se2.between(truth[:-1], truth[1:]))
+        log = replace(log, odometry=Odometry(log.odometry.stamps, se2.chain(truth[0], steps)))
+        compared = compare(log)
+        own = compared.within(150.0, 155.0)
+        if not found:
+            compared.lidar[own] += [0.04, 0.0, 0.0]
+        assert wheel_motion.lost(log, compared) == [pytest.approx(stretch, abs=0.5) for stretch in found]
 
 
 def test_a_pair_matches_clearly_worse_at_twice_the_square_of_another_that_noise_allows():
