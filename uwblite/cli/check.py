@@ -58,7 +58,7 @@ def summary_json(name: str, diagnosis: Diagnosis, cost: dict[str, float]) -> dic
     }
 
 
-def report_lines(name: str, diagnosis: Diagnosis, cost: dict[str, float], *, mapped: bool = True) -> list[str]:
+def report_lines(name: str, diagnosis: Diagnosis, cost: dict[str, float], *, mapped: bool) -> list[str]:
     """Return the findings and figures as lines of text; what a finding explains stands below it."""
     lines = [f"{name}: {_counts(diagnosis.figures)}", ""]
     for finding, explains in folded(diagnosis.findings):

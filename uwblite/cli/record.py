@@ -130,7 +130,7 @@ class _Watching:
             self._child.stop()
 
 
-def _status_line(recorder: Recorder, watching: _Watching | None = None) -> Any:
+def _status_line(recorder: Recorder, watching: _Watching | None) -> Any:
     """Return what draws the status line, on a terminal only, and looks after the page."""
     bar = Progress()
 

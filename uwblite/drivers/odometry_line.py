@@ -129,7 +129,7 @@ LEAP_RATE, LEAP_ACCELERATION = 1.0, 50.0
 """rad/s by which two readings may differ by vibration, and rad/s^2 that no robot reaches: more is a damaged digit."""
 
 
-def gyro_format(columns: str, time_unit: float = 1.0, angle_unit: float = 1.0, prefix: str = "") -> LineFormat:
+def gyro_format(columns: str, time_unit: float, angle_unit: float, prefix: str) -> LineFormat:
     """Return the form of a gyro's lines; units are s of t, rad of theta and rad/s of turn_rate, below 0 = clockwise.
 
     Raises

@@ -213,13 +213,12 @@ def placed(lines: Ints, stamps: Floats, false: Bools, what: str, warnings: list[
     return np.where(false, np.interp(lines, lines[~false], stamps[~false]), stamps)
 
 
-def time_order(stamps: Floats, what: str, warnings: list[str], set_back: dict[str, float] | None = None) -> Ints:
+def time_order(stamps: Floats, what: str, warnings: list[str], set_back: dict[str, float]) -> Ints:
     """Return the order (n,) that sorts stamps, and warn of late ones; set_back takes by how much at most, s, by what."""
     late = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps) - CONFIRMED))
     if late:
         warnings.append(f"{late} of {len(stamps)} {what} messages came out of time order; sorted by stamp")
-        if set_back is not None:
-            set_back[what] = 0.0 if _in_parts(stamps) else float(np.max(np.maximum.accumulate(stamps) - stamps))
+        set_back[what] = 0.0 if _in_parts(stamps) else float(np.max(np.maximum.accumulate(stamps) - stamps))
     return np.argsort(stamps, kind="stable")
 
 

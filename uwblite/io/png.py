@@ -57,7 +57,7 @@ def decode_png(data: bytes, path: str = "") -> Image:
     return _unfiltered(np.frombuffer(raw, dtype=np.uint8).reshape(height, -1), channels, path)
 
 
-def png_shape(data: bytes, path: str = "") -> tuple[int, int, int]:
+def png_shape(data: bytes, path: str) -> tuple[int, int, int]:
     """Return height, width and channels from the beginning of a PNG; raise FormatError for a kind not read here."""
     if not data.startswith(SIGNATURE):
         raise FormatError("this is not a PNG picture", path)

@@ -58,7 +58,7 @@ def write_bag(path: str | os.PathLike[str], log: SensorLog, *, storage: str = "m
     write_messages(path, recording_messages(log), storage=storage)
 
 
-def write_messages(path: str | os.PathLike[str], messages: Iterable[Stamped], *, storage: str = "mcap") -> None:
+def write_messages(path: str | os.PathLike[str], messages: Iterable[Stamped], *, storage: str) -> None:
     """Write messages as a ROS 2 bag, whole or not at all; see `write_bag`."""
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer

@@ -204,9 +204,7 @@ def _looked_up(
     return Correspondences(part, rows, target, good, nx * dx + ny * dy, (nx, ny), (rx, ry))
 
 
-def condensed(
-    clouds: Clouds, found: Correspondences, scale: float | Floats, root_weight: Floats | None = None
-) -> PairFactors:
+def condensed(clouds: Clouds, found: Correspondences, scale: float | Floats, root_weight: Floats | None) -> PairFactors:
     """Condense the matches of each pair into the quadratic form of its relative pose; roots of weights are (e, n)."""
     row, good, r, (nx, ny), (rx, ry) = found.row, found.good, found.distance, found.normal, found.arm
     root = good / (1.0 + np.square(r * (1.0 / scale)))

@@ -110,7 +110,7 @@ class Canvas:
         fraction = step / np.maximum(count - 1, 1)[owner]
         self._dab(start[owner] + fraction[:, None] * way[owner], width / 2.0, colour, opacity)
 
-    def polyline(self, points: Floats, width: float, colour: Colour, opacity: float = 1.0) -> None:
+    def polyline(self, points: Floats, width: float, colour: Colour, opacity: float) -> None:
         self.lines(np.concatenate([points[:-1], points[1:]], axis=1), width, colour, opacity)
 
     def discs(self, centres: Floats, radius: float, colour: Colour) -> None:

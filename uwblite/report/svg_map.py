@@ -19,7 +19,7 @@ _BAR, _BELOW = 1 / 5, 1 / 40
 """Longest length of the scale bar, and its distance from the corner, as shares of the map's longer side."""
 
 
-def map_svg(drawn: DrawnMap, image: str = "") -> str:
+def map_svg(drawn: DrawnMap, image: str) -> str:
     """Return the map as SVG markup, with the style of `page`.
 
     `image` is the address of the picture of the bare grid, one pixel a cell, highest y first; "" = none.

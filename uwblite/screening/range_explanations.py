@@ -229,7 +229,7 @@ def _on_stretch(log: SensorLog, traces: Sequence[Trace], offsets: Floats, longes
 
 
 def _at_moments(
-    log: SensorLog, traces: Sequence[Trace], near: Explanation | None = None, *, to_compare: bool = False
+    log: SensorLog, traces: Sequence[Trace], near: Explanation | None = None, *, to_compare: bool
 ) -> list[Explanation]:
     """Return names that are exchanged, and paths that go on elsewhere, from a moment on.
 
@@ -362,7 +362,7 @@ class Moment:
             return each, kept
         return names, self.refined(motions[best : best + 1], PathPolicy.usual_motion, names=names)
 
-    def rows(self, to_compare: bool = False) -> Iterator[Explanation]:
+    def rows(self, to_compare: bool) -> Iterator[Explanation]:
         """Yield what explains a change; nothing where nothing could.
 
         Where the likelihood with all anchors at any place exceeds that of the path by no very strong evidence nothing needs an
