@@ -6,7 +6,7 @@ import threading
 import pytest
 
 from uwblite.errors import FormatError
-from uwblite.io.source import open_input, open_source, read_bounded
+from uwblite.io.source import MAX_LINE_BYTES, OVERLONG_LINE, open_input, open_source, read_bounded
 
 
 def test_a_pipe_with_a_writer_is_read(tmp_path):
@@ -55,3 +55,17 @@ def test_line_ends_of_old_macintosh_programs_are_named(tmp_path):
     (tmp_path / "old.log").write_bytes(b"ODOM 0 0 0 0 0 0 1 h 1\r" * 3)
     with pytest.raises(FormatError, match="its lines end in CR alone"), open_source(tmp_path / "old.log") as source:
         list(source.blocks())
+
+
+@pytest.mark.parametrize("size", [1 << 16, 300_001, 1 << 21, 1 << 23])
+@pytest.mark.parametrize("last", [b"", b"endless", b"after\n"])
+def test_of_a_line_that_is_too_long_its_place_is_left(tmp_path, size, last):
+    """Whatever the blocks are: those around it are whole, and each has its number. A block may hold it whole."""
+    around, endless = [b"before %d\n" % k for k in range(1000)], b"x" * (3 << 20) + b"\n"
+    lines = [*around, endless, *around, endless, *around, last.replace(b"endless", endless[:-1])]
+    (tmp_path / "a.log").write_bytes(b"".join(lines))
+    with open_source(tmp_path / "a.log") as source:
+        found = b"".join(source.blocks(size)).splitlines()
+    written = b"".join(lines).splitlines()
+    short, expected = ([OVERLONG_LINE if len(line) > MAX_LINE_BYTES else line for line in some] for some in (found, written))
+    assert short == expected

@@ -5,6 +5,8 @@ import pytest
 from helpers.registration_worlds import CORRIDOR, ROOM, cloud, pair, wall_points
 
 from uwblite import se2
+from uwblite.config import override
+from uwblite.errors import ConfigError
 from uwblite.lidar.cloud_rasters import rasterize, surface_field
 from uwblite.lidar.clouds import joined
 from uwblite.lidar.correlative_matching import CorrelativeConfig, _peaks, score_grid, search
@@ -194,3 +196,9 @@ def test_the_shoulder_of_a_peak_is_no_peak(axis):
     slope = np.where(np.arange(3) == axis, 0.05, 1.0)
     scores = np.maximum(1.0 - np.abs(at) @ slope, 0.0).astype(np.float32)
     assert _peaks(scores, CorrelativeConfig(resolution=0.25, angle_step=0.1)).tolist() == [[6, 6, 6]]
+
+
+@pytest.mark.parametrize("name", ["resolution", "angle_step", "spread", "candidates"])
+def test_steps_and_widths_are_above_zero(name):
+    with pytest.raises(ConfigError, match=rf"{name} = 0(\.0)? is out of range"):
+        override(CorrelativeConfig(), [f"{name}=0"])
