@@ -84,7 +84,9 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
         return graph
     if radios:
         floats = int(np.flatnonzero(hypothesis == 0)[-1])
-        off = float(_mean_under(mean, covariance, before, tried[floats][0])[0])
+        # What a robot that stands measured determines no unit.
+        known = bool(np.isfinite(worth[floats, 0]))
+        off = float(_mean_under(mean, covariance, before, tried[floats][0])[0]) if known else np.inf
         against = -np.inf if abs(off) > UnitPolicy.farthest else np.log(UnitPolicy.too_short) if off < UnitPolicy.short else 0.0
         odds = odds + np.where((hypothesis == 0) & (np.arange(len(odds)) > 0), against, 0.0)
     worth = worth + odds[:, None] + np.log(_odds(len(biases)))
