@@ -242,6 +242,35 @@ def test_a_disagreement_lasts_six_seconds_and_pairs_that_do_not_match_say_nothin
     assert disagreeing(few, 0.0) == []
 
 
+@pytest.mark.parametrize(("factor", "share", "said"), [(-1.0, 1.0, True), (-1.0, 0.8, False), (0.8, 1.0, False)])
+def test_small_turns_that_all_differ_from_half_time_are_said(factor, share, said):
+    """Curves of 0.04 rad within half a second, one pair of three; a single one shows no difference of 0.08 rad."""
+    found = pairs(240)
+    turns = np.arange(0, 240, 3)
+    found.wheels[turns, 2] = 0.04 * np.where(turns % 2, 1.0, -1.0)
+    found.lidar[:] = found.wheels
+    later = turns[turns >= 120]
+    found.lidar[later[np.arange(len(later)) % 10 < 10.0 * share], 2] *= factor
+    facts = disagreeing(found, 0.0)
+    assert len(facts) == said
+    for fact in facts:
+        assert fact.figures["stretches"] == [pytest.approx((120.0, 237.5), abs=3.5)]
+        assert not fact.figures["slips"]
+
+
+def test_scans_that_have_nothing_in_common_with_the_wheels_replace_none():
+    """The wheels stand for 10 s, and the scans move in any direction all the time."""
+    rng = np.random.default_rng(1)
+    found = pairs(100, lidar=rng.uniform(-0.3, 0.3, (100, 3)))
+    (remark,) = told(disagreeing(found, 0.0))
+    assert (remark.severity, remark.stretches) == ("doubt", ())
+    assert "nothing in common" in remark.text
+    time = 0.1 * np.arange(1000)
+    log = SensorLog(driven(np.where((time > 50.0) & (time < 60.0), 0.0, 0.2), 0.0 * time), None)
+    assert wheel_motion.lost(log, found) == []
+    assert np.isnan(found.way_ratio)
+
+
 def test_of_many_stretches_three_are_said():
     found = pairs(400)
     for first in range(20, 400, 80):

@@ -59,6 +59,7 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
         "marked-ranges": _of(_PLACES, "uncertain odometry-alone untied-parts few-in-reach few-ranges"),
         "repeated-ranges": _of("few-ranges anchor-unplaced no-anchor odometry-alone uncertain"),
         "repeated-scans": _of("odometry-alone untied-parts silences"),
+        "odometry-alone": _of("uncertain"),
         "worse-than-parts": _of(_PLACES, "path-displaced free-space-violation"),
         "wheels-against-lidar": _of(_BY_SCANS, _PLACES, "carried range-scatter path-displaced"),
         "scales": _of(_PLACES, "range-scatter poor-fit free-space-violation path-displaced unusual-calibration"),

@@ -295,8 +295,14 @@ def gyro(used: float = 0.0, bias: float = 0.0, rests: bool = False, why: str = "
 def wheels_against_lidar(start: float, stretches: Sequence[tuple[float, float]], slips: bool) -> Finding:
     """Doubt a recording whose wheels and lidar measure different motions for long; warn where the wheels slip for a time.
 
-    One factor for all motions is taken out before.
+    One factor for all motions is taken out before. Without stretches the two have nothing in common anywhere.
     """
+    if not stretches:
+        text = (
+            "the motions that wheels and lidar measure have nothing in common: the scans are out of order, of another "
+            "recording or in disorder themselves, or the odometry is; check both drivers"
+        )
+        return Finding("wheels-against-lidar", DOUBT, text)
     when = spans([(a - start, b - start) for a, b in stretches])
     text = f"the wheels count more motion than the lidar measures ({when}): they slip there, and the map follows the lidar"
     if not slips:

@@ -108,7 +108,7 @@ def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[Ancho
         own = table["recording"] == finding.recording - 1
         inside = [own & still & (stamps >= a) & (stamps <= b) for a, b in finding.stretches]
         agree = own.any() and near[own].mean() >= _MOST_NEAR
-        if agree and all(len(set(anchor[r].tolist())) >= _ENOUGH and near[r].mean() >= _MANY_NEAR for r in inside):
+        if agree and inside and all(len(set(anchor[r].tolist())) >= _ENOUGH and near[r].mean() >= _MANY_NEAR for r in inside):
             text = f"{finding.text}; the ranges agree with the lidar there: check the wheels"
             finding = replace(finding, severity=WARNING, text=text)
         yield finding

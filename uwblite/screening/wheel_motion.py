@@ -50,6 +50,8 @@ class PairPolicy:
     """Motion between the scans of a pair that is larger than noise, m and rad."""
     clear: tuple[float, float] = (0.05, 0.1)
     """Distance, m, and turn, rad, that are large enough for a ratio."""
+    related: float = 0.5
+    """Correlation of the motions by two sensors that both work, at least."""
     enough: int = 12
     """Pairs whose median is a figure."""
     lasting: int = 6
@@ -79,15 +81,26 @@ def times_as_large(others: Floats, motions: Floats, clear: float) -> float:
 
 
 def lidar_by_wheels(wheels: Floats, lidar: Floats, clear: float, otherwise: float) -> float:
-    """Return how many times as large as the wheels' motions (e, d) the lidar's are; `otherwise` where too few are clear.
+    """Return how many times as large as the wheels' motions (e, d) the lidar's are; `otherwise` where too few are clear, or
+    the two have nothing in common.
 
     Noise of one sensor, such as rounding, draws the ratio to its own motions down (regression dilution). So the ratio to the
     other's motions is taken as well, and of both the one that is nearer to 1.
     """
+    if unrelated(wheels, lidar, clear):
+        return otherwise
     ratio, inverse = times_as_large(lidar, wheels, clear), times_as_large(wheels, lidar, clear)
     if not (ratio > 0.0 and inverse > 0.0):
         return otherwise if np.isnan(ratio) else ratio
     return min(ratio, 1.0 / inverse, key=lambda value: abs(np.log(value)))
+
+
+def unrelated(wheels: Floats, lidar: Floats, clear: float) -> bool:
+    """Return whether clear motions by wheels and by lidar (e, d) have nothing in common.
+
+    The product of the slopes of the one by the other and of the other by the one is their correlation, squared.
+    """
+    return 0.0 <= times_as_large(lidar, wheels, clear) * times_as_large(wheels, lidar, clear) < PairPolicy.related**2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,6 +130,12 @@ class Pairs(Table):
     def seen(self, start: float, end: float) -> bool:
         """Return whether scans show if the robot moves between two times, s."""
         return 2 * int(self.within(start, end).sum()) >= PairPolicy.lasting
+
+    @property
+    def unrelated(self) -> bool:
+        """Whether the ways by lidar and wheels have nothing in common."""
+        own = self.rows(self.measured)
+        return unrelated(own.wheels[:, :2], own.lidar[:, :2], PairPolicy.clear[0])
 
     @property
     def way_ratio(self) -> float:
@@ -220,7 +239,12 @@ def _span(odometry: Odometry) -> float:
 
 
 def lost(log: SensorLog, pairs: Pairs) -> list[tuple[float, float]]:
-    """Return the stretches in which the wheels stand and the scans move, and match clearly worse if the robot stood."""
+    """Return the stretches in which the wheels stand and the scans move, and match clearly worse if the robot stood.
+
+    Scans that show other motions than the wheels wherever these drive do not show that they fail where they stand.
+    """
+    if pairs.unrelated:
+        return []
     moving = (np.hypot(*pairs.lidar[:, :2].T) > PairPolicy.moving) | (np.abs(pairs.lidar[:, 2]) > PairPolicy.moving)
     found = []
     for a, b in standing(log.odometry):
@@ -260,16 +284,37 @@ def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> lis
         differs, *sizes = (np.linalg.norm(motion[:, part], axis=1) for motion in (own.lidar - wheels, own.lidar, wheels))
         off = differs > allowed + PairPolicy.relative * np.maximum(*sizes)
         along = np.sum((wheels - own.lidar)[:, part] * wheels[:, part], axis=1)
-        more.append(off & drives & (along > 0.5 * differs * sizes[1]))
+        # Of a way that a slipping wheel counts all may be missing, but no more.
+        within = (along > 0.5 * differs * sizes[1]) & (along < (sizes[1] + allowed) * sizes[1])
+        more.append(off & drives & within)
         bad |= off
     if log is not None and bad.any():
         by_lidar, by_wheels = (_misfits(log, own.rows(bad), motion[bad]) for motion in (own.lidar, wheels))
         bad[bad] = by_wheels > PairPolicy.worse * by_lidar
     smooth = np.convolve(bad, np.ones(lasting) / lasting, mode="same") > PairPolicy.matching
+    smooth |= _turn_otherwise(own.lidar[:, 2], wheels[:, 2])
     runs = [(a, b) for a, b in runs_of(smooth) if own.end[b - 1] - own.start[a] >= lasting]
     slips = all(max(np.mean(of[a:b]) for of in more) > 0.5 and b + lasting // 2 < len(smooth) for a, b in runs)
     stretches = [(float(own.start[a]), float(own.end[b - 1])) for a, b in runs]
-    return [Fact.of("wheels-against-lidar", start=start, stretches=stretches, slips=slips)] if stretches else []
+    stretches = [] if pairs.unrelated else stretches
+    fact = Fact.of("wheels-against-lidar", start=start, stretches=stretches, slips=slips)
+    return [fact] if stretches or pairs.unrelated else []
+
+
+def _turn_otherwise(lidar: Floats, wheels: Floats) -> Bools:
+    """Return which pairs (e,) are of a stretch in which nearly all clear turns (e,) differ.
+
+    Pairs of a straight way say nothing about turns. Where so many differ each may do so by less than a single one shows.
+    """
+    larger, count = np.maximum(np.abs(lidar), np.abs(wheels)), 2 * PairPolicy.enough
+    least = PairPolicy.allowed[1] * np.sqrt(PairPolicy.lasting / count) + PairPolicy.relative * larger
+    found, clear = np.zeros(len(larger), dtype=bool), np.flatnonzero(larger > PairPolicy.moving)
+    off = (np.abs(lidar - wheels) > least)[clear]
+    if len(clear) >= count:
+        for k in np.flatnonzero(np.convolve(off, np.ones(count) / count, mode="valid") >= MOST).tolist():
+            row = clear[k : k + count][off[k : k + count]]
+            found[row[0] : row[-1] + 1] = True
+    return found
 
 
 def unmatched(pairs: Pairs) -> list[Fact]:
