@@ -7,7 +7,7 @@ from pathlib import Path
 WHEELS = (
     "wheels-stand-still", "wheels-against-lidar", "odometry-slips", "odometry-unit", "drift",
     "turn-scale", "heading-against-path", "mirrored", "odometry-breaks", "odometry-glitches",
-    "unusual-calibration", "scales", "laser-turned-over", "path-displaced", "wheels-against-ranges",
+    "unusual-calibration", "scales", "laser-turned-over", "path-displaced", "wheels-against-ranges", "loose-links",
 )  # fmt: skip
 LIDAR = (
     "laser-turned-over", "laser-turned-away", "scans-do-not-match", "wheels-against-lidar", "free-space-violation",
@@ -37,6 +37,7 @@ OWN = {
     "all stamps in minutes": ("minutes",), "laser: noise only": ("scans-do-not-match",),
     "laser mirrored": ("laser-turned-over",),
     "carried away, stamps closed up": (*CUT, "wheels-against-ranges"), "carried away, a gap of 40 s": CUT,
+    "all anchors moved 2 m half-way": (*RADIO, "odometry-slips", "wheels-against-ranges"),
     "all anchors moved as one half-way": (*RADIO, "carried", "odometry-slips", "wheels-against-ranges"),
     "odometry absent for 40 %": CUT,
     "lidar absent for 40 %": CUT, "half of the scans an hour late": CLOCKS, "clock of the radio back 30 s": ("clock-set-back",),
@@ -51,7 +52,7 @@ OWN = {
     "the clock of all runs 1 % fast": CLOCKS, "nine of ten readings lost": (*RADIO, "uncertain", *CUT),
     "an anchor moved, one wheel slips": WHEELS + RADIO, "wheels frozen for 20 s, an anchor moved": ("wheels-stand-still",),
     "wheels frozen for 20 s, the lidar absent": ("wheels-stand-still", *CUT), "one wheel loose, the lidar absent": WHEELS + CUT,
-    "the lidar knocked, an anchor moved": LIDAR + RADIO,
+    "the lidar knocked, an anchor moved": LIDAR + RADIO, "each half of the time has the scans of the other": (*LIDAR, *CLOCKS),
 }  # fmt: skip
 """Rows whose cause has a name of its own."""
 

@@ -62,6 +62,11 @@ def reversed_scans(case: Case, rng: Rng) -> Case:
     return with_scans(case, lambda s: replace(s, ranges=s.ranges[::-1].copy()))
 
 
+def other_half(case: Case, rng: Rng) -> Case:
+    """Each half of the recording has the scans of the other one: two files were joined in the wrong order."""
+    return with_scans(case, lambda s: replace(s, ranges=np.roll(s.ranges, len(s.stamps) // 2, axis=0)))
+
+
 def covered_beams(case: Case, rng: Rng) -> Case:
     """A cable hangs before a third of the beams from half-way on."""
 

@@ -17,6 +17,11 @@ def clock_back(kinds: str) -> Fault:
     return lambda case, rng: shifted(case, lambda t: np.where(t >= case.middle, -30.0, 0.0), kinds)
 
 
+def wrapped_clock(kinds: str, period: float) -> Fault:
+    """The clock of some sensors counts up to a period, s, and begins again: 16 bits of milliseconds."""
+    return lambda case, rng: shifted(case, lambda t: (t - case.log.odometry.stamps[0]) // period * -period, kinds)
+
+
 def clock_forward(kinds: str) -> Fault:
     """The clock of some sensors is set forward by an hour half-way."""
     return lambda case, rng: shifted(case, lambda t: np.where(t >= case.middle, 3600.0, 0.0), kinds)

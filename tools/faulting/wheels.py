@@ -64,6 +64,15 @@ def redriven(way: float, turn: float) -> Fault:
     return lambda case, rng: with_odometry(case, change)
 
 
+def heading_without_sign(case: Case, rng: Rng) -> Case:
+    """The heading is taken from a quaternion as twice the arc cosine of w: it is never negative."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        return np.column_stack([poses[:, :2], np.abs(se2.wrap_angle(poses[:, 2]))])
+
+    return with_odometry(case, change)
+
+
 def from_half(fault: Fault) -> Fault:
     """Another fault of the wheels from half time on: the chain of steps goes on where it was."""
 
