@@ -34,7 +34,7 @@ def passed(arrivals, spacing, others=(), members=lambda number: ()):
             times += [due] * len(ready)
         ready = backlog.take(Frame(now, number), now, spacing, members(number))
         if number in others:
-            ready += backlog.take("other", now, None)
+            ready += backlog.take(Corrupt("other"), now, None)
         out, times = out + ready, times + [now] * len(ready)
     ready = backlog.release()
     return out + ready, times + [arrivals[-1]] * len(ready)
@@ -82,6 +82,18 @@ def test_a_pause_that_is_filled_in_part_ends_with_its_frames():
     assert max(abs(frame.stamp - time) for frame, time in zip(out, sent, strict=True)) < 0.101
 
 
+@pytest.mark.parametrize("spacing", [0.1, 0.0])
+def test_a_buffer_that_overflows_in_a_pause_keeps_its_first_frames(spacing):
+    """What came after them was lost, and the bytes between are damaged; without damage nothing shows which were lost."""
+    sent = [0.1 * k for k in (*range(50), *range(50, 80), *range(115, 170))]
+    out, _ = passed(held(sent, 4.95, 11.45), spacing, others=(79,))
+    out = [frame for frame in out if isinstance(frame, Frame)]
+    assert max(abs(frame.stamp - time) for frame, time in zip(out, sent, strict=True)) < 0.11
+    for damaged in ((), (50,)):
+        out, _ = passed(held(sent, 4.95, 11.45), spacing, others=damaged)
+        assert out[-56].stamp > 11.3
+
+
 def test_rounds_that_come_as_several_lines_are_no_pause_and_fill_one():
     """A board prints four lines in every round of 0.1 s."""
     sent = [0.1 * (k // 4) for k in range(1200)]
@@ -98,7 +110,7 @@ def test_rounds_that_come_as_several_lines_are_no_pause_and_fill_one():
 
 def test_what_is_no_frame_keeps_its_place_and_waits_only_behind_frames():
     out, _ = passed([0.0, 0.1, 0.2, 2.0, 2.0, 2.1, 2.2, 2.3, 2.4], 0.1, others=(1, 3))
-    assert [getattr(item, "number", item) for item in out] == [0, 1, "other", 2, 3, "other", 4, 5, 6, 7, 8]
+    assert [getattr(item, "number", "other") for item in out] == [0, 1, "other", 2, 3, "other", 4, 5, 6, 7, 8]
     assert Backlog().take("other", 1.0, None) == ["other"]
 
 

@@ -2,7 +2,8 @@
 
 All frames of a pause arrive at its end. One that comes after a pause waits, with those behind it, until they come no faster
 than usual: the last one came at its own time, those before it at their usual distances. Where they do not fill the pause, the
-rest of it was silence. A round of several frames, one for each anchor, begins where one of its members comes again: rounds
+rest of it was silence; but where bytes were damaged behind frames that came together, a buffer has overflowed that kept the
+first ones, which go on from those before the pause. A round of several frames, one for each anchor, begins where one of its members comes again: rounds
 have the usual distance, and each frame its usual place in the round.
 """
 
@@ -11,6 +12,8 @@ from collections import deque
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
+
+from .events import Corrupt
 
 PAUSE, LEAST_PAUSE = 3.0, 0.1
 """Times the usual distance of frames, and s, that a pause is longer than: shorter lumps are usual."""
@@ -106,7 +109,8 @@ class Backlog:
             begun = min(begun, self._begun)  # nothing shows when the last was sent: they go on from those before the pause
         last = begun + sent[-1]
         shrink = min(1.0, (last - self._begun) / max(sent[-1], 1e-9))
-        times = iter(last - shrink * (sent[-1] - each) for each in sent)
+        kept = _before_overflow(waiting, sent)
+        times = iter([self._begun + each for each in sent[:kept]] + [last - shrink * (sent[-1] - each) for each in sent[kept:]])
         events = []
         for held in waiting:
             event = held.event
@@ -129,6 +133,14 @@ class Backlog:
         self._came.update(members)
         self._places.update(dict.fromkeys(members, stamp - self._begun))
         self._last = stamp
+
+
+def _before_overflow(waiting: list[_Held], sent: list[float]) -> int:
+    """Return how many of the frames that wait stand before bytes that were lost, having come faster than they were sent, s."""
+    damage = next((k for k, held in enumerate(waiting) if isinstance(held.event, Corrupt)), 0)
+    frames = [held.event.stamp for held in waiting[:damage] if held.spacing is not None]
+    together = bool(frames) and frames[-1] - frames[0] < (sent[len(frames) - 1] - sent[0]) * LOOK / FAST
+    return len(frames) if together else 0
 
 
 def _usual(steps: deque[float]) -> tuple[float, float]:
