@@ -164,6 +164,16 @@ def test_a_base_that_was_switched_on_again_holds_its_pose():
     assert pose.stamp == pytest.approx(9.02)
 
 
+def test_a_base_whose_counts_leap_further_than_wheels_turn_holds_its_pose():
+    """Its clock and its counts begin again, from no zero."""
+    actions = drive([feedback(500, 20000, 20000), feedback(501, 20040, 20040), feedback(0, 4000, 4000, stamp=10.04),
+                     feedback(1, 4040, 4040, stamp=10.06)])  # fmt: skip
+    last, again, pose = poses(actions)[-3:]
+    assert (again.x, again.y, again.theta) == (last.x, last.y, last.theta)
+    assert pose.x - again.x == pytest.approx(40 * kobuki.TICK)
+    assert [note.name for note in actions if isinstance(note, Note)] == ["odometry-gap"]
+
+
 def test_a_base_whose_clock_leaps_while_its_wheels_count_on_did_not_restart():
     """20 s of packets are lost, after 20 s in which the link held back those before: the base drives on at 0.2 m/s."""
     step = 0.2 * 0.02 / kobuki.TICK

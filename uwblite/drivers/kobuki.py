@@ -130,11 +130,12 @@ class KobukiDriver(BaseDriver):
         reading, last, self._last = self._clock.read(event.time, event.stamp), self._last or event, event
         if reading.elapsed is not None and reading.elapsed <= 0:
             return [Corrupt("packet sent twice")]
-        restarted = reading.reset and _began_again(last, event)
+        elapsed = reading.elapsed or max(event.stamp - last.stamp, PERIOD)
+        leapt = _way(event.left - last.left, event.right - last.right) > FASTEST * (elapsed + PERIOD)
+        restarted = leapt or (reading.reset and _began_again(last, event))
         if restarted:
             self._odometer.forget()
         # The gyro's angle is absolute, so the heading holds over any gap; the travel is ambiguous after a long one.
-        elapsed = reading.elapsed or max(event.stamp - last.stamp, PERIOD)
         travel, _ = self._odometer.update(event.left, event.right, event.heading, still=elapsed > MAX_GUESS)
         actions: list[Action] = [Lost(reading.missing)] if reading.missing else []
         if restarted or elapsed > MAX_BLIND:
