@@ -216,6 +216,19 @@ def test_a_tag_that_answers_and_ranges_to_nobody_is_not_called_another_device(tm
     assert text.endswith("it answers, but measures nothing")
 
 
+def test_what_came_last_before_a_silence_is_not_its_cause(tmp_path):
+    """A damaged line 0.2 s after the last good one, and nothing any more."""
+
+    class FallsSilent(TalkingPort):
+        def read(self):
+            lines, elapsed = super().read(), self._clock() - self._began
+            return lines if elapsed < 3.0 else b"damaged\n" if lines and elapsed < 3.2 else b""
+
+    _, notes = record(tmp_path, {"odometry": BASE}, 8.0, lambda url, clock: FallsSilent(clock))
+    (text,) = [note.text for _, note in notes if note.name == "odometry-no-data"]
+    assert "check power and cable" in text
+
+
 @pytest.mark.parametrize("name", ["line", "gyro-line", "shell", "makerfabs", "scip", "kobuki"])
 def test_a_line_that_never_ends_is_kept_in_part_and_counted(name):
     columns = {"line": "?columns=t,x,y,theta", "gyro-line": "?columns=t,turn_rate"}.get(name, "")

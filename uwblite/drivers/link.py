@@ -195,9 +195,10 @@ class Link:
         silent, note = now - max(self.last_message, self.opened), None
         if silent > SILENCE and not self.quiet and not self.session.is_catching_up:
             self._fall_silent()
-            if now - self.session.last_event < SILENCE:
+            # What came last before a device fell silent says nothing of the silence.
+            if now - self.session.last_event < 0.5 * silent:
                 why = "it answers, but measures nothing"
-            elif now - self.last_data < SILENCE:
+            elif now - self.last_data < 0.5 * silent:
                 why = "bytes come, but no good frame: wrong bit rate, wrong device or a bad cable"
             else:
                 why = "check power and cable; unplug it and plug it in again"
