@@ -198,6 +198,8 @@ def by_columns(columns: str, unit: float = 1.0, prefix: str = "") -> Parse:
 
 MOST_LEAP, NEAR = 100_000, 3
 """Rounds that may be lost together; rounds within which the next one must follow a leap, as a damaged digit leaps too."""
+FASTER = 2.0
+"""Times the mean rate at which rounds came, for those that are missing."""
 OTHER_TAG = "line of a tag that was seen once"
 MUCH = 50
 """Rounds in a row without a range after which it is reported."""
@@ -217,6 +219,8 @@ class UwbDriver(LineDriver):
         self._first: Line | None = None
         """The line of a tag that was seen once."""
         self._round: int | None = None
+        self._rounds, self._begun, self._latest = 0, 0.0, 0.0
+        """Numbered rounds that came; s, arrival of the first and of the last."""
         self._guard = RangeGuard(self.health)
 
     def time_of(self, content: Ranges | Refused) -> float | None:
@@ -249,7 +253,7 @@ class UwbDriver(LineDriver):
 
     def _ranges(self, line: Line) -> list[Action]:
         self.ready, content = True, line.content
-        actions: list[Action] = [Lost(count)] if (count := self._missed(content)) else []
+        actions: list[Action] = [Lost(count)] if (count := self._missed(content, line.stamp)) else []
         stamp, _, lost = self.timed(line)
         actions += lost
         self._empty = 0 if content.readings else self._empty + 1
@@ -258,13 +262,18 @@ class UwbDriver(LineDriver):
             actions += self.say_once(Note("warning", "uwb-no-ranges", text))
         return [*actions, *self._guard.take(RangeEpoch(stamp, content.readings), line.stamp)]
 
-    def _missed(self, line: Ranges) -> int:
+    def _missed(self, line: Ranges, stamp: float) -> int:
         """Return how many rounds were missed before the line before this one, by their numbers; 0 where the board restarted."""
         if line.round is None:
             return 0
-        step = 1 if self._round is None else line.round - self._round
+        before, pause, usual = self._round, stamp - self._latest, (self._latest - self._begun) / max(self._rounds - 1, 1)
+        self._begun = self._begun if self._rounds else stamp
+        self._round, self._rounds, self._latest = line.round, self._rounds + 1, stamp
+        step = 1 if before is None else line.round - before
         step = step % line.modulus if line.modulus else step
-        leap, self._leap, self._round = self._leap, step - 1 if 1 < step <= MOST_LEAP else 0, line.round
+        # A number that wraps leaps ahead where the board restarted, too, but there was no time for so many rounds.
+        possible = step <= MOST_LEAP and (not line.modulus or (step - NEAR) * usual <= FASTER * pause)
+        leap, self._leap = self._leap, step - 1 if step > 1 and possible else 0
         return leap if 0 < step <= NEAR else 0
 
     def stop(self) -> list[Action]:
