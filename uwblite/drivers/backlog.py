@@ -2,15 +2,16 @@
 
 All frames of a pause arrive at its end. One that comes after a pause waits, with those behind it, until they come no faster
 than usual: the last one came at its own time, those before it at their usual distances. Where they do not fill the pause, the
-rest of it was silence; but where bytes were damaged behind frames that came together, a buffer has overflowed that kept the
-first ones, which go on from those before the pause. A round of several frames, one for each anchor, begins where one of its members comes again: rounds
-have the usual distance, and each frame its usual place in the round.
+rest of it was silence. But frames that came together before anything else go on from those before the pause: behind damaged
+bytes others are missing, because a buffer has overflowed, and an answer shows that the stream was begun anew. A round of
+several frames, one for each anchor, begins where one of its members comes again: rounds have the usual distance, and each
+frame its usual place in the round.
 """
 
 import math
 from collections import deque
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import takewhile
 from typing import Any
 
 from .events import Corrupt
@@ -18,7 +19,8 @@ from .events import Corrupt
 PAUSE, LEAST_PAUSE = 3.0, 0.1
 """Times the usual distance of frames, and s, that a pause is longer than: shorter lumps are usual."""
 LOOK, MOST_LOOK, FAST = 4.0, 0.5, 8
-"""Usual distances, at most so many s, in which fewer frames than FAST show that they come no faster than usual."""
+"""Usual distances, at most so many s, in which fewer frames than FAST show that they come no faster than usual; of a faster
+stream fewer than it sends in so much longer that they are looked for in LEAST_PAUSE: usual lumps are no end."""
 MEMORY, USUAL = 256, 0.9
 """Distances that are remembered, and the share of them that is usual."""
 MOST = 1 << 16
@@ -72,17 +74,19 @@ class Backlog:
                 return [event]
             held = _Held(event, mean, _usual(self._periods)[1] if spacing == 0.0 else spacing, members)
         self._waiting.append(held)
-        return self.due(now)
+        answered = spacing is None and not isinstance(event, Corrupt) and _interrupted(self._waiting) > 0
+        return self.release() if answered else self.due(now)
 
     def deadline(self) -> float | None:
         """Return the time at which events that wait need not do so any longer, s."""
         if not self._waiting:
             return None
-        latest_first = reversed(self._waiting[-MEMORY:])
-        frames = list(islice(((held.event.stamp, held.spacing) for held in latest_first if held.spacing is not None), FAST))
+        frames = [held for held in self._waiting[-MEMORY:] if held.spacing is not None]
         if not frames:
             return None
-        return float(frames[-1][0] + min(LOOK * frames[0][1], MOST_LOOK))
+        spacing = max(frames[-1].spacing or 0.0, LEAST_PAUSE / MEMORY)
+        many = max(FAST, math.ceil(FAST / LOOK * LEAST_PAUSE / spacing))
+        return float(frames[-many:][0].event.stamp + min(many * spacing * LOOK / FAST, MOST_LOOK))
 
     def due(self, now: float) -> list[Any]:
         """Return the events that need not wait any longer at time `now`, s."""
@@ -109,7 +113,7 @@ class Backlog:
             begun = min(begun, self._begun)  # nothing shows when the last was sent: they go on from those before the pause
         last = begun + sent[-1]
         shrink = min(1.0, (last - self._begun) / max(sent[-1], 1e-9))
-        kept = _before_overflow(waiting, sent)
+        kept = _interrupted(waiting)
         times = iter([self._begun + each for each in sent[:kept]] + [last - shrink * (sent[-1] - each) for each in sent[kept:]])
         events = []
         for held in waiting:
@@ -135,12 +139,13 @@ class Backlog:
         self._last = stamp
 
 
-def _before_overflow(waiting: list[_Held], sent: list[float]) -> int:
-    """Return how many of the frames that wait stand before bytes that were lost, having come faster than they were sent, s."""
-    damage = next((k for k, held in enumerate(waiting) if isinstance(held.event, Corrupt)), 0)
-    frames = [held.event.stamp for held in waiting[:damage] if held.spacing is not None]
-    together = bool(frames) and frames[-1] - frames[0] < (sent[len(frames) - 1] - sent[0]) * LOOK / FAST
-    return len(frames) if together else 0
+def _interrupted(waiting: list[_Held]) -> int:
+    """Return how many frames stand before the first event that is none, having come faster than they were sent."""
+    frames = list(takewhile(lambda held: held.spacing is not None, waiting))
+    if len(frames) == len(waiting) or not frames:
+        return 0
+    came, sent = frames[-1].event.stamp - frames[0].event.stamp, sum(held.spacing or 0.0 for held in frames[1:])
+    return len(frames) if came < sent * LOOK / FAST else 0
 
 
 def _usual(steps: deque[float]) -> tuple[float, float]:
