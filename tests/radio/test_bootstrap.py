@@ -31,6 +31,12 @@ bootstrapped trajectory is good enough as a start when it lies well within the w
 
 def start(wheels: Odometry, radio: UwbRanges, calibrated: bool = True) -> tuple[BootstrapResult, np.ndarray]:
     """Bootstrap one recording; return the estimate and the keyframes' stamps."""
+    graph, measured, stamps = problem(wheels, radio, calibrated)
+    return bootstrap_graph(graph, measured, TrilaterationConfig()), stamps
+
+
+def problem(wheels: Odometry, radio: UwbRanges, calibrated: bool = True) -> tuple[Graph, Measured, np.ndarray]:
+    """Return the graph of one recording, what was measured, and the keyframes' stamps."""
     frames = select(wheels, KeyframeConfig())
     ids = radio.anchor_ids
     listed = unknowns(CalibrationConfig(anchor_height=0.0), ids, np.zeros(len(ids), dtype=bool)) if calibrated else ()
@@ -43,8 +49,7 @@ def start(wheels: Odometry, radio: UwbRanges, calibrated: bool = True) -> tuple[
     edges = range_edges(attached, ids, mounting, calibration, RangeNoiseConfig(0.1), LONGEST_RANGE)
     path = np.concatenate([[0.0], np.cumsum(frames.path)])
     measured = Measured(wheel_edges(frames, OdometryNoiseConfig(), calibration), edges, path, 1.5 * SIGMA)
-    found = bootstrap_graph(graph, measured, TrilaterationConfig())
-    return found, frames.stamps
+    return graph, measured, frames.stamps
 
 
 def judged(bootstrapped, keyframe_stamps, stamps, truth, places) -> tuple[float, float]:
@@ -131,6 +136,20 @@ def reversed_in_time(wheels: Odometry, radio: UwbRanges) -> tuple[Odometry, UwbR
         (end - radio.stamps)[::-1], radio.anchor[::-1].copy(), radio.ranges[::-1].copy(), radio.quality, radio.anchor_ids
     )
     return Odometry((end - wheels.stamps)[::-1], wheels.poses[::-1].copy()), back
+
+
+@pytest.mark.parametrize(("turn_scale", "agrees"), [(1.0, True), (3.0, False)])
+def test_an_attempt_goes_on_to_the_end_while_its_ranges_agree(turn_scale, agrees):
+    """Wheels that count three turns for one contradict the ranges long before the end."""
+    rng = np.random.default_rng(2)
+    stamps, truth = wander(rng, 200.0)
+    radio = ranges(rng, stamps, truth, places_around(rng, 6), sigma=SIGMA)
+    graph, measured, _ = problem(odometry(stamps, truth, rng, turn_scale=turn_scale), radio)
+    attempt = Attempt(graph, measured, TrilaterationConfig())
+    assert attempt.agrees_to_the_end() is agrees
+    assert attempt.complete is agrees
+    assert attempt.placed.all() or not agrees
+    assert attempt.path[attempt.high - 1] - attempt.path[attempt.low] < 120.0 or agrees
 
 
 @pytest.mark.parametrize("seed", [31, pytest.param(32, marks=pytest.mark.slow)])
