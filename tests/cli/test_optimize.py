@@ -208,3 +208,13 @@ def test_whoever_sets_the_iterations_gets_as_many(tmp_path, capsys, monkeypatch)
 def test_closures_that_hold_are_not_accused(tmp_path, capsys):
     path = written(tmp_path / "good.g2o", loop(3, n=200, anchors=0)[0])
     assert not figures(capsys, path)["closures"]["contradict"]
+
+
+def test_several_robots_are_not_placed_one_pose_after_the_other(tmp_path, capsys):
+    lines = [f"VERTEX_SE2 {k} {name}{k} {k} {y} 0" for name, y in (("A", 0), ("B", 3)) for k in range(3)]
+    lines += [f"EDGE_SE2 {k} {name}{k} {name}{k + 1} 1 0 0 1e-4 0 0 1e-4 0 1e-4" for name in "AB" for k in range(2)]
+    lines += [f"EDGE_RANGE {k} {name}{k} L0 {np.hypot(k - 1, 1.5):.4f} 0.0025" for name in "AB" for k in range(3)]
+    (tmp_path / "two.pyfg").write_text("\n".join(lines) + "\n")
+    assert main(["optimize", str(tmp_path / "two.pyfg"), "--incremental"]) == 1
+    assert "--incremental places the poses of one robot; " in (said := capsys.readouterr().err)
+    assert "has 2 chains of odometry" in said

@@ -11,6 +11,7 @@ import pytest
 from helpers.results import small_log
 
 from uwblite.errors import ConfigError, FormatError, UwbliteError
+from uwblite.io.bag_reading import open_bag
 from uwblite.io.bag_topics import TopicPlan
 from uwblite.io.carmen import read_log
 from uwblite.io.rosbag import BagTopics, Collector, plan_bag, read_bag
@@ -302,3 +303,20 @@ def test_an_error_names_the_bag_that_was_asked_for():
     with pytest.raises(OSError, match="uwblite") as refused:
         write_bag("/proc/uwblite.mcap", recording())
     assert refused.value.filename == "/proc/uwblite.mcap"
+
+
+def test_messages_whose_definition_the_bag_does_not_hold_are_named(tmp_path):
+    import sqlite3
+
+    from rosbags.rosbag2 import Writer
+
+    with Writer(tmp_path / "bag", version=9) as writer:
+        connection = writer.add_connection("/odd", "my_msgs/msg/Odd", msgdef="float64 x\n", rihs01="RIHS01_00")
+        writer.write(connection, 10**9, b"\0\1\0\0" + bytes(8))
+    with sqlite3.connect(next((tmp_path / "bag").glob("*.db3"))) as database:
+        database.execute("DELETE FROM message_definitions")
+    with (
+        pytest.raises(FormatError, match="definition of my_msgs/msg/Odd, on /odd, cannot be read: the bag does not hold it"),
+        open_bag(tmp_path / "bag") as bag,
+    ):
+        list(bag.messages(["/odd"]))

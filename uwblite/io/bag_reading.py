@@ -229,7 +229,7 @@ class OpenBag:
                 # One name may have stood for two things in the course of a recording: the first counts.
                 store.register({name: how for name, how in types.items() if name not in store.fielddefs})
             except KeyError:
-                self.unreadable[kind] = "the bag does not hold it"
+                continue
             except Exception as error:  # the parser has errors of many kinds for what is no definition
                 self.unreadable[kind] = _words(error, 100)
         return store
