@@ -192,9 +192,9 @@ class PacketReader(FrameReader):
 class FixedPackets(PacketReader):
     """Packets of one size behind one head; a protocol derives from this and defines `is_good` and `decode`."""
 
-    head = b"\x00"
+    head: bytes
     """First bytes of every packet."""
-    size = 1
+    size: int
     """Bytes of a packet."""
 
     def __init__(self) -> None:
