@@ -17,7 +17,7 @@ from uwblite.odometry.slips import LASTS
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.problem.alternatives import EvidencePolicy
 from uwblite.radio.bootstrap import bootstrap_graph, of_likeliest_slips
-from uwblite.radio.bootstrap_attempt import Attempt, BootstrapResult, Measured
+from uwblite.radio.bootstrap_attempt import Attempt, BootstrapPolicy, BootstrapResult, Measured
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import TrilaterationConfig
@@ -275,9 +275,8 @@ def test_the_mirror_image_of_an_attempt_is_a_rival_that_turns_the_other_way():
     assert sound.mirrored().evidence() < solved.evidence() - EvidencePolicy.very_strong
 
 
-@pytest.mark.parametrize("marked", [[(22, 26)], [(22, 26), (5, 9)], [(5, 9), (22, 26), (32, 36)], [(24, 28)], []])
-def test_slips_that_nothing_pays_for_go_and_others_are_found(marked):
-    """Wheels that count half a metre and 0.2 rad too much over each of four steps, and slips that are not there."""
+def slipping_over_four_steps() -> Attempt:
+    """Return the attempt with true poses, and wheels that count half a metre and 0.2 rad too much over each of four steps."""
     truth = se2.chain(np.zeros(3), np.tile([0.5, 0.0, 0.15], (39, 1)))
     motion = se2.between(truth[:-1], truth[1:])
     motion[22:26] += [0.5, 0.0, 0.2]
@@ -289,6 +288,26 @@ def test_slips_that_nothing_pays_for_go_and_others_are_found(marked):
     measured = Measured(wheels, plain_ranges(pose, anchor, distance, 0.05), 0.5 * np.arange(40.0), 0.05)
     attempt = Attempt(Graph(truth.copy(), anchors), measured, TrilaterationConfig(), ())
     attempt.placed[:], attempt.low, attempt.high, attempt.poses = True, 0, 40, truth.copy()
+    return attempt
+
+
+@pytest.mark.parametrize("forward", [True, False])
+def test_an_attempt_that_slips_is_where_its_measurements_cost_least(forward):
+    """But for the pose at the end that is known, which stays."""
+    attempt = slipping_over_four_steps()
+    slips = attempt.slipping(10, 36, forward=forward)
+    assert set(np.flatnonzero(slips.slips)) <= set(range(18, 30))
+    known = 10 if forward else 35
+    again = slips._copy()
+    again._anneal(10, 36, known, BootstrapPolicy.scales[1:])
+    np.testing.assert_allclose(slips.poses, again.poses, atol=0.01)
+    np.testing.assert_array_equal(slips.poses[known], attempt.poses[known])
+
+
+@pytest.mark.parametrize("marked", [[(22, 26)], [(22, 26), (5, 9)], [(5, 9), (22, 26), (32, 36)], [(24, 28)], []])
+def test_slips_that_nothing_pays_for_go_and_others_are_found(marked):
+    """Slips of the wheels over four steps, and some that are not there."""
+    attempt = slipping_over_four_steps()
     for first, last in marked:
         attempt.slips[first:last] = 1.0
     attempt = attempt.with_slips(attempt.slips)
