@@ -74,3 +74,10 @@ def test_more_than_a_log_keeps_apart_is_refused(tmp_path, capsys):
     assert main(["record", *["--uwb", "tlv:a"] * 10, "--out", out]) == 1
     assert "keeps 9 apart" in capsys.readouterr().err
     assert pytest.approx(0) == len(list(tmp_path.iterdir()))
+
+
+def test_one_port_for_two_devices_is_refused(tmp_path, capsys):
+    (tmp_path / "again").symlink_to("/dev/null")
+    ports = ["--uwb", "tlv:/dev/null", "--lidar", f"scip:{tmp_path / 'again'}"]
+    assert main(["record", *ports, "--out", str(tmp_path / "run.log")]) == 1
+    assert "lidar and uwb are given the same port" in capsys.readouterr().err

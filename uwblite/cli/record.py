@@ -1,6 +1,7 @@
 """``uwblite record``: read the tag, the lidar and the base, and write a log; and devices of the command line for others."""
 
 import argparse
+import os
 import re
 import signal
 import socket
@@ -169,7 +170,10 @@ def device_links(args: argparse.Namespace, pose: Pose = (0.0, 0.0, 0.0)) -> list
         for k, spec in enumerate(specs, start=1):
             session, url = open_device(sensor, spec, Setup(pose))
             links.append(Link(sensor, url, session, k))
+    ports: dict[str, str] = {}
     for link in links:
+        if (other := ports.setdefault(os.path.realpath(link.url), link.name)) != link.name:
+            raise ConfigError(f"{other} and {link.name} are given the same port, {link.url}: a port has one device")
         check_url(link.url)
         if not is_socket(link.url):
             pyserial()

@@ -196,9 +196,10 @@ class Link:
         if silent > SILENCE and not self.quiet and not self.session.is_catching_up:
             self._fall_silent()
             # What came last before a device fell silent says nothing of the silence.
-            if now - self.session.last_event < 0.5 * silent:
+            lately = 0.5 * silent if self.counts.messages else silent
+            if now - self.session.last_event < lately:
                 why = "it answers, but measures nothing"
-            elif now - self.last_data < 0.5 * silent:
+            elif now - self.last_data < lately:
                 why = "bytes come, but no good frame: wrong bit rate, wrong device or a bad cable"
             else:
                 why = "check power and cable; unplug it and plug it in again"
