@@ -35,6 +35,7 @@ SHORTEST_PERIOD = 0.1
 _BRIDGE = "The USB bridge of the DEV board can hang: unplug it and plug it in again"
 _PORT = "check that the port is the DWM1001's"
 SILENT = Note("error", "uwb-silent", f"uwb: no answer. {_BRIDGE}; {_PORT} and that no other program has it")
+_SILENT = "no fix and no answer"
 _FOREIGN = "uwb: bytes come, but none that a DWM1001 sends"
 UNREADABLE = Note("error", "uwb-unreadable", f"{_FOREIGN}: {_PORT}, and that it talks at {tlv.BAUD} bit/s")
 _SHELL = "open a terminal on the port at 115200 bit/s, press Enter twice quickly"
@@ -145,12 +146,13 @@ class Dwm1001Driver(Driver):
             self.ready = True
             if not self._stream:
                 return
+            why = _SILENT
             if self._shell:
-                yield from self._read_lines()
+                why = yield from self._read_lines()
             else:
                 self._poller = self._poller or FixPoller(self, self.period)
                 yield from self._poller.script()
-            yield Note("warning", "uwb-restart", "uwb: no fix and no answer; starting the module again")
+            yield Note("warning", "uwb-restart", f"uwb: {why}; starting the module again")
 
     # ---- finding out the mode, and changing it
 
@@ -211,10 +213,11 @@ class Dwm1001Driver(Driver):
                 texts.append(event.text)
         self._learn(node_facts(texts))
 
-    def _read_lines(self) -> Script[None]:
-        """Read the stream until no more lines come; the command toggles it, so it is sent until they do, while it is echoed."""
+    def _read_lines(self) -> Script[str]:
+        """Read the stream until no more lines come, and return why; the command toggles it, so it is sent until they do, while
+        it is echoed."""
         self._streaming = self._begun = self._missed = True
-        tries = 4
+        tries, why = 4, _SILENT
         while tries:
             tries -= 1
             yield Send(b"lec\r")
@@ -222,10 +225,14 @@ class Dwm1001Driver(Driver):
             while (event := (yield Wait(until))) is not None:
                 answered = True
                 if isinstance(event, RangeLine):
-                    until, tries = self.now + max(3.0, 3 * self.period), 4
+                    until, tries, self._binary = self.now + max(3.0, 3 * self.period), 4, False
+                elif isinstance(event, tlv.Answer):
+                    tries, why, until = 0, "it restarted and left its shell", self.now
             if not answered:  # not even an echo: it is no longer in its shell
                 break
+            self._binary = True
         self._streaming = False
+        return why
 
     def _take_line(self, line: RangeLine) -> Iterator[Action]:
         """Log a line. It has no sum: a range that leaps or a new anchor must come again."""
