@@ -320,5 +320,19 @@ def test_ranges_of_another_scale_are_a_doubt_where_anchors_are_placed(scale, pla
 def test_a_lidar_whose_ways_differ_by_more_than_15_percent_from_the_wheels_is_named(ratios, said):
     """By the first such recording; recordings that compare nothing do not count."""
     each = [{"screening": Screening((), OdometryBreaks.none(), lidar_by_wheels=ratio)} for ratio in ratios]
-    found = check_lengths(estimate_of(Graph(np.zeros((3, 3)))), task_of(standing(len(ratios) + 1, lidar=True, each=each)))
+    recordings = standing(len(ratios) + 1, lidar=True, each=each)
+    found = check_lengths(estimate_of(Graph(np.zeros((2 * len(ratios) + 2, 3)))), task_of(recordings))
     assert [n.figures["lidar_by_wheels"] for n in found if n.severity == "doubt"] == ([] if said is None else [said])
+
+
+def test_a_map_as_long_as_the_wheels_count_has_no_other_scale():
+    """Pairs of single scans that show little have one error in common; the map's steps do not."""
+    walk, rng = np.zeros((40, 3)), np.random.default_rng(1)
+    walk[:, 0] = 0.1 * np.arange(40)
+    screening = Screening((), OdometryBreaks.none(), lidar_by_wheels=1.2)
+    recordings = recordings_of(walk, lidar=True, each=[{"screening": screening}])
+    said = {}
+    for longer in (1.0, 1.1, 1.2):
+        path = walk * [longer, 1.0, 1.0] + rng.normal(0.0, 0.002, (40, 3))
+        said[longer] = [f.kind for f in check_lengths(estimate_of(Graph(path)), task_of(recordings))]
+    assert said == {1.0: [], 1.1: [], 1.2: ["scales"]}

@@ -118,6 +118,18 @@ def test_anchors_that_stay_keep_their_names_and_nothing_is_told(held):
     assert (warned(task.stages), doubted(task.stages)) == ([], [])
 
 
+@pytest.mark.parametrize("given", [False, True])
+def test_an_anchor_at_another_optimum_is_put_where_its_ranges_have_it(given):
+    """It was placed along a path by wheels that slipped; a place that the user gave stays."""
+    estimate, task = planted(given=Constraints((GivenAnchor("C"),)) if given else None)
+    elsewhere = np.vstack([PLACES[:2], [[-25.0, -20.0]], PLACES[3:]])
+    estimate = replace(estimate, graph=replace(estimate.graph, anchors=elsewhere))
+    found = decide_places(estimate, task)
+    assert found.anchor_ids == NAMES
+    np.testing.assert_allclose(found.graph.anchors, elsewhere if given else PLACES, atol=0.4)
+    assert (warned(task.stages), doubted(task.stages)) == ([], [])
+
+
 @pytest.mark.parametrize("held", [True, False])
 def test_an_anchor_that_is_moved_has_two_places(held):
     estimate, task = planted(moves=[(0, 1, (-2.0, 1.5), 70.0, 70.0)], held=held, height=None if held else 0.0)

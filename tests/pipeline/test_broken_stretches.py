@@ -18,6 +18,7 @@ from uwblite.graph.pose_edges import ScanEdges
 from uwblite.lidar.scan_matching import pairs_of
 from uwblite.odometry.keyframes import KeyframeConfig
 from uwblite.pipeline import keyframe_data
+from uwblite.pipeline.anchor_places import decide_places
 from uwblite.pipeline.broken_steps import _without_unused, broken_steps, range_evidence
 from uwblite.pipeline.broken_stretches import _likelihood, _stretch, replace_broken_stretches
 from uwblite.pipeline.estimate import Task
@@ -107,9 +108,9 @@ def test_a_path_that_scans_tore_by_three_metres_over_a_slip_is_mended():
     assert finding.figures["off"] == pytest.approx(3.0, abs=0.5)
     assert int(re.search("`end=([0-9]+)`", finding.cure)[1]) == pytest.approx(SLIP, abs=2.0)
     assert "`use_lidar=false`" in finding.cure
-    # What was said of anchors along the torn path has a cause; what was said of clocks has another.
+    # Along the mended path no anchor seems displaced any more; what was said of clocks has another cause.
     by_kind = {finding.kind: finding.explained_by for finding in explained(told(task.stages.facts))}
-    assert by_kind == {"path-displaced": ("worse-than-parts",), "clock-offset": (), "worse-than-parts": ()}
+    assert by_kind == {"clock-offset": (), "worse-than-parts": ()}
 
 
 def test_a_radio_that_is_wrong_as_a_whole_is_not_followed():
@@ -119,30 +120,49 @@ def test_a_radio_that_is_wrong_as_a_whole_is_not_followed():
     ((gain, step),) = broken_steps(estimate, task, np.zeros(0, dtype=np.intp))
     assert gain > 0.0
     assert len(step.moves) >= 3
-    assert replace_broken_stretches(estimate, task) is estimate
-    assert [fact.kind for fact in task.stages.facts] == ["path-displaced"]
+    placed = decide_places(estimate, task)
+    assert replace_broken_stretches(placed, task) is placed
 
 
 def test_one_anchor_that_is_moved_breaks_no_path():
     estimate, task, _ = walked(shift=(2.5, -1.5), moved=(1,))
-    assert replace_broken_stretches(estimate, task) is estimate
-    assert ([fact.kind for fact in task.stages.facts], task.stages.done) == (["path-displaced"], [])
+    placed = decide_places(with_range_noise(estimate, task.config), task)
+    stages = len(task.stages.done)
+    assert replace_broken_stretches(placed, task) is placed
+    assert [fact.kind for fact in task.stages.facts] == ["moved-anchor"]
+    assert len(task.stages.done) == stages
 
 
 def test_a_sound_path_stays_and_costs_no_solution():
-    """A slip that the scans followed rightly is no broken step."""
+    """A slip that the scans followed rightly is no broken step; what was said of an earlier path is said no more."""
     estimate, task, _ = walked()
     assert replace_broken_stretches(estimate, task) is estimate
-    assert ([fact.kind for fact in task.stages.facts], task.stages.done) == (["path-displaced"], [])
+    assert (task.stages.facts, task.stages.done) == ([], [])
 
 
-def test_nothing_is_compared_where_one_anchor_moved_or_none():
+def test_nothing_is_compared_where_no_anchor_moved():
     sound, task, _ = walked()
     estimate = torn(sound, task, np.array([3.0, 0.0, 0.0]))
     task.stages.facts.clear()
     assert replace_broken_stretches(estimate, task) is estimate
-    task.stages.note("moved-anchor", anchor="A", distance=1.0)
-    assert replace_broken_stretches(estimate, task) is estimate
+
+
+def test_an_anchor_that_seemed_moved_along_a_path_since_mended_has_one_place():
+    estimate, task, _ = walked()
+    estimate = with_range_noise(estimate, task.config)
+    ranges = estimate.ranges
+    late = (ranges.stamps > SLIP) & (ranges.anchor == 1)
+    yes, anchors = np.ones(5, dtype=bool), np.vstack([ANCHORS, ANCHORS[1] + [2.5, -1.5]])
+    graph = replace(estimate.graph, anchors=anchors, fixed_anchors=~yes)
+    split = replace(
+        estimate, graph=graph, anchor_ids=(*estimate.anchor_ids, f"{estimate.anchor_ids[1]}@2"),
+        ranges=replace(ranges, anchor=np.where(late, 4, ranges.anchor)), bootstrap=BootstrapResult(graph, yes, ((),) * 5, ~yes),
+    )  # fmt: skip
+    task.stages.note("moved-anchor", anchor=estimate.anchor_ids[1], distance=2.9)
+    found = replace_broken_stretches(split, task)
+    assert found.anchor_ids == estimate.anchor_ids
+    assert [fact.kind for fact in task.stages.facts if fact.kind != "clock-offset"] == []
+    np.testing.assert_allclose(found.graph.anchors, ANCHORS, atol=0.4)
 
 
 @pytest.mark.parametrize("part", ["scans", "ranges", "joint"])

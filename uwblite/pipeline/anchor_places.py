@@ -15,6 +15,7 @@ import numpy as np
 from ..arrays import Floats, Ints
 from ..findings import Fact
 from ..graph.solver import Optimizer
+from ..problem.alternatives import EvidencePolicy
 from ..problem.solution import rough
 from ..radio.place_evidence import Explanation
 from ..radio.place_intervals import explain
@@ -22,6 +23,9 @@ from ..sensor_log.sensors import place_name, radio_name
 from .broken_steps import BreakPolicy, RadioTrack, radio_tracks, without_moves_of_path
 from .estimate import Estimate, Task
 from .radio_stages import with_range_noise, with_selected_priors
+
+MOVES = ("moved-anchor", "path-displaced")
+"""Kinds of what is said of anchors' places: of the last decision, along the path as it was then."""
 
 
 def decide_places(estimate: Estimate, task: Task) -> Estimate:
@@ -40,7 +44,7 @@ def decide_places(estimate: Estimate, task: Task) -> Estimate:
             estimate = with_range_noise(candidate, task.config)
             break
         estimate = _reoptimised(candidate, task)
-    task.stages.facts.extend(facts)
+    task.stages.restate(MOVES, facts)
     if estimate is not first:
         task.stages.end("places of anchors", places=len(estimate.anchor_ids))
     return estimate
@@ -50,8 +54,20 @@ def _same(one: Estimate, other: Estimate) -> bool:
     """Return whether two estimates have the same places, and the same ranges of each."""
     assert one.ranges is not None
     assert other.ranges is not None
-    same = one.anchor_ids == other.anchor_ids and np.array_equal(one.ranges.anchor, other.ranges.anchor)
-    return same and np.array_equal(one.ranges.alive, other.ranges.alive)
+    if one.anchor_ids != other.anchor_ids or not np.array_equal(one.ranges.anchor, other.ranges.anchor):
+        return False
+    apart = np.hypot(*(one.graph.anchors - other.graph.anchors).T)
+    return bool(np.all(apart <= EvidencePolicy.same_anchor)) and np.array_equal(one.ranges.alive, other.ranges.alive)
+
+
+def _likelier(radio: RadioTrack, explanation: Explanation, anchor: Floats) -> bool:
+    """Return whether the one place of a radio's ranges is likelier than where its anchor (2,) stands, at its own likeliest.
+
+    An anchor that was placed along a path by wheels that slipped is at another optimum of its ranges along the lidar's path.
+    """
+    start = replace(explanation.found[0], position=anchor)
+    present = radio.model.with_places(replace(explanation, found=(start,)), radio.model.alone)
+    return explanation.evidence - present.evidence > EvidencePolicy.positive
 
 
 def _reoptimised(estimate: Estimate, task: Task) -> Estimate:
@@ -74,8 +90,12 @@ def _apply_places(
     recording = task.recordings.of_keyframe[ranges.pose]
     ids, anchors, anchor = list(estimate.anchor_ids), list(estimate.graph.anchors), ranges.anchor.copy()
     weights, source, hypotheses = ranges.own_weights.copy(), list(range(len(ids))), list(bootstrap.hypotheses)
+    # Along a path that follows the ranges, or where the user says where anchors are, one place stays.
+    replaced = not estimate.rests_on_ranges and not task.constraints.anchors
     for radio, explanation in zip(radios, explanations, strict=True):
         if len(radio.numbers) == len(explanation.found) == 1:
+            if replaced and _likelier(radio, explanation, anchors[radio.numbers[0]]):
+                anchors[radio.numbers[0]] = explanation.found[0].position
             continue
         place = explanation.place[np.searchsorted(radio.chosen, np.arange(len(radio.rows)), "right") - 1]
         names = _names(radio.name, place, recording[radio.rows])

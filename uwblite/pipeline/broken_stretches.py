@@ -19,7 +19,7 @@ from ..lidar.scan_to_scan import TrackingConfig
 from ..odometry.slips import log_densities, with_slips
 from ..problem.solution import rough
 from . import lidar_stages, surface_adjustment
-from .anchor_places import decide_places
+from .anchor_places import MOVES, decide_places
 from .broken_steps import BreakPolicy, BrokenStep, broken_steps, range_evidence
 from .estimate import Estimate, Task
 from .radio_stages import with_range_noise
@@ -32,13 +32,12 @@ _AROUND = 2.0
 
 def replace_broken_stretches(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate with broken steps of the lidar's path left to wheels and radio where that is more probable."""
-    said = [fact.kind for fact in task.stages.facts if fact.kind in _SYMPTOMS]
-    if said in ([], ["moved-anchor"]):
+    said = [fact.kind for fact in task.stages.facts if fact.kind in MOVES]
+    if not said or estimate.scans is None or estimate.ranges is None or estimate.joint is None or estimate.rests_on_ranges:
         return estimate
-    if estimate.scans is None or estimate.ranges is None or estimate.joint is None or estimate.rests_on_ranges:
-        return estimate
-    wheels, found = estimate.odometry, list[Fact]()
-    while len(found) < BreakPolicy.rounds and (step := _proposed(estimate, task)) is not None:
+    wheels, found, first = estimate.odometry, list[Fact](), estimate
+    # One anchor alone that moves is no symptom.
+    while said != ["moved-anchor"] and len(found) < BreakPolicy.rounds and (step := _proposed(estimate, task)) is not None:
         stretch = _stretch(estimate, task, step.begin)
         other = _released(estimate, task, step, stretch)
         gain = _gain(other, estimate, wheels, task, step) + float(np.log(BreakPolicy.broken))
@@ -47,10 +46,12 @@ def replace_broken_stretches(estimate: Estimate, task: Task) -> Estimate:
             break
         found.append(_fact(estimate, other, step, stretch, task))
         estimate = other
-    if not found:
+    # The path has been mended since the places were decided, here or by matches of scans.
+    estimate = decide_places(estimate, task)
+    if estimate is first:
         return estimate
     task.stages.facts += found
-    estimate = lidar_stages.solve_by_own_errors(decide_places(estimate, task), task)
+    estimate = lidar_stages.solve_by_own_errors(estimate, task)
     return surface_adjustment.adjust_surfaces(estimate, task)
 
 
@@ -59,10 +60,6 @@ def _proposed(estimate: Estimate, task: Task) -> BrokenStep | None:
     steps = broken_steps(estimate, task, _suspects(estimate, task))
     gain, step = max(steps, key=lambda each: each[0], default=(0.0, None))
     return step if gain > 0.0 else None
-
-
-_SYMPTOMS = ("moved-anchor", "path-displaced")
-"""Kinds of what is said of ranges along a broken path; one anchor alone that moves is no symptom."""
 
 
 def _off(estimate: Estimate) -> Bools:
