@@ -244,12 +244,20 @@ def path_placements(
         distance = np.hypot(*(se2.transform(motion, tags) - points).T)
         return np.append(roots * (distance - ranges), motion / size)
 
+    def slopes(motion: Floats) -> Floats:
+        tag = se2.transform(motion, tags)
+        away, arm = tag - points, tag - motion[:2]
+        direction = away / np.maximum(np.hypot(*away.T), TINY)[:, None]
+        turn = direction[:, 1] * arm[:, 0] - direction[:, 0] * arm[:, 1]
+        return np.vstack([roots[:, None] * np.column_stack([direction, turn]), np.eye(3) / size])
+
     found = list[PathPlacement]()
     for heading in np.linspace(0.0, 2.0 * np.pi, _HEADINGS, endpoint=False):
         away = points - se2.rotate(np.full(len(tags), heading), tags)
         rows = roots[:, None] * np.column_stack([-2.0 * away, np.ones(len(away))])
         place = np.linalg.lstsq(rows, roots * (ranges**2 - np.sum(away**2, axis=1)), rcond=None)[0][:2]
-        done = least_squares(errors, np.append(place, se2.wrap_angle(heading)), loss="cauchy", f_scale=USUAL_KERNEL.scale)
+        start = np.append(place, se2.wrap_angle(heading))
+        done = least_squares(errors, start, jac=slopes, loss="cauchy", f_scale=USUAL_KERNEL.scale)
         motion = np.append(done.x[:2], se2.wrap_angle(done.x[2]))
         found.append(PathPlacement(float(done.cost), motion, done.jac.T @ done.jac))
     return sorted(found, key=lambda each: each.cost)
