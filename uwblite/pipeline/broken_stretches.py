@@ -1,8 +1,8 @@
 """Never worse than its parts: where ranges and odometry deny a step of the lidar's path, the map without that step competes.
 
 Both are scored on one set of measurements, with associations made anew for either: the evidence of all ranges with the
-anchors' likeliest places and moves, the odometry's steps with the tail of slips, and the rays of one side of the step on the
-surfaces and in the free space of the other. Ranges that are wrong together do not outweigh what both sides saw.
+anchors' likeliest places and moves, the odometry's steps there with the tail of slips, and the rays of one side of the step on
+the surfaces and in the free space of the other. Ranges that are wrong together do not outweigh what both sides saw.
 """
 
 from dataclasses import replace
@@ -32,15 +32,19 @@ _AROUND = 2.0
 
 def replace_broken_stretches(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate with broken steps of the lidar's path left to wheels and radio where that is more probable."""
+    if estimate.scans is None or estimate.ranges is None or estimate.joint is None or estimate.rests_on_ranges:
+        return estimate
     said = [fact.kind for fact in task.stages.facts if fact.kind in MOVES]
-    if not said or estimate.scans is None or estimate.ranges is None or estimate.joint is None or estimate.rests_on_ranges:
+    if not said and not len(_suspects(estimate, task)):
         return estimate
     wheels, found, first = estimate.odometry, list[Fact](), estimate
     # One anchor alone that moves is no symptom.
     while said != ["moved-anchor"] and len(found) < BreakPolicy.rounds and (step := _proposed(estimate, task)) is not None:
         stretch = _stretch(estimate, task, step.begin)
         other = _released(estimate, task, step, stretch)
-        gain = _gain(other, estimate, wheels, task, step) + float(np.log(BreakPolicy.broken))
+        # Elsewhere wheels and lidar hold the path together, and what the lidar says there is not counted.
+        counted = wheels.rows((wheels.i >= stretch[0]) & (wheels.j <= stretch[1]))
+        gain = _gain(other, estimate, counted, task, step) + float(np.log(BreakPolicy.broken))
         task.stages.end("broken stretch", begin=float(task.recordings.stamps[stretch[0]]), gain=gain)
         if gain <= 0.0:
             break
@@ -63,8 +67,9 @@ def _proposed(estimate: Estimate, task: Task) -> BrokenStep | None:
 
 
 def _off(estimate: Estimate) -> Bools:
-    """Return which steps (e,) of the odometry contradict the path."""
-    return np.asarray(np.abs(estimate.odometry.residuals(estimate.graph)).max(axis=1) > BEYOND_NOISE)
+    """Return which steps (e,) of the odometry contradict the path, or may as wheels slip over them."""
+    off = np.abs(estimate.odometry.residuals(estimate.graph)).max(axis=1)
+    return np.asarray(estimate.slipped | (off > BEYOND_NOISE))
 
 
 def _suspects(estimate: Estimate, task: Task) -> Ints:
