@@ -55,6 +55,16 @@ def test_a_radio_whose_clock_runs_fast_or_slow_is_set_right(seed, late, rate):
     np.testing.assert_allclose(moved.ranges.stamps, sound, atol=1.0)
 
 
+@pytest.mark.parametrize(("anchors", "metres"), [([0], 77.0), ([0, 1, 2, 3], 153.9), ([1, 2], 77.4)])
+def test_antenna_delays_that_were_never_set_are_taken_off(anchors, metres):
+    """77 m for the anchor, twice that where the tag has none either; boards differ by decimetres."""
+    log = late_by(0.0)
+    late = np.isin(log.ranges.anchor, anchors)
+    shifted, (fact,) = explained_by_ranges(replace(log, ranges=replace(log.ranges, ranges=log.ranges.ranges + metres * late)))
+    assert (fact.kind, fact.figures["anchors"]) == ("antenna-delay", [log.ranges.anchor_ids[a] for a in anchors])
+    np.testing.assert_allclose(shifted.ranges.ranges, log.ranges.ranges, atol=0.5)
+
+
 def test_a_sound_recording_has_nothing_to_explain():
     log = late_by(0.0)
     assert explained_by_ranges(log) == (log, [])

@@ -18,6 +18,7 @@ RADIO = (
     "range-scatter", "ranges-disagree", "anchors-moved-together", "anchor-distrusted", "anchor-unplaced",
     "anchor-mirror-ambiguous", "moved-anchor", "repeated-ranges", "marked-ranges", "sustained-outliers",
     "drift", "no-anchor", "odometry-alone", "unusual-calibration", "scales", "exchanged-names",
+    "antenna-delay",
 )  # fmt: skip
 CLOCKS = (
     "clock-set-back", "clock-jump", "stamps-in-bursts", "stamps-of-receipt", "made-up-stamps", "late-scans", "late-ranges",

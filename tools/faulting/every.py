@@ -177,8 +177,8 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "each half of the time has the scans of the other": (lidar.other_half, LIDAR),
     "heading without its sign": (wheels.heading_without_sign, WHEELS),
     "stamps of the lidar begin again every 65.536 s": (logs.wrapped_clock("lidar", 65.536), LIDAR),
-    "no antenna delay set": (radio.no_antenna_delay(1000), RADIO),
-    "no antenna delay set in one anchor": (radio.no_antenna_delay(1), RADIO),
+    "no antenna delay set": (radio.no_antenna_delay(1000, tag=True), RADIO),
+    "no antenna delay set in one anchor": (radio.no_antenna_delay(1, tag=False), RADIO),
     "another robot's ranges": (radio.mixed_robots(1.0), RADIO),
     "an anchor moved, one wheel slips": (
         lambda case, rng: wheels.slipping_wheel(radio.moved_anchor(case, rng), rng), RADIO,

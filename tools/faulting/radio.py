@@ -125,9 +125,11 @@ def _longer(case: Case, r: UwbRanges, place: Floats, shift: Floats) -> Floats:
     return np.hypot(*(place + shift - tag).T) - np.hypot(*(place - tag).T)
 
 
-def no_antenna_delay(anchors: int) -> Fault:
-    """The antenna delay of the first so many anchors was never set: it is 154 m, two of 16,436 units of 4.69 mm."""
-    return lambda case, rng: with_ranges(case, lambda r: replace(r, ranges=r.ranges + 154.0 * (r.anchor < anchors)))
+def no_antenna_delay(anchors: int, tag: bool) -> Fault:
+    """The antenna delay of the first so many anchors, and of the tag, was never set: 76.97 m each, half of 513.48 ns."""
+    return lambda case, rng: with_ranges(
+        case, lambda r: replace(r, ranges=r.ranges + 76.97 * ((r.anchor < anchors).astype(float) + tag))
+    )
 
 
 def stuck_anchor(case: Case, rng: Rng) -> Case:
@@ -136,7 +138,7 @@ def stuck_anchor(case: Case, rng: Rng) -> Case:
     def change(r: UwbRanges) -> UwbRanges:
         own = np.flatnonzero((r.anchor == 0) & (r.stamps >= case.middle))
         ranges = r.ranges.copy()
-        ranges[own] = ranges[own[0]] + rng.integers(-1, 2, len(own)) * 0.01
+        ranges[own] = ranges[own[:1]] + rng.integers(-1, 2, len(own)) * 0.01
         return replace(r, ranges=ranges)
 
     return with_ranges(case, change)

@@ -128,6 +128,11 @@ TEXTS: Mapping[str, Text] = {
         DOUBT,
         "radio",
     ),
+    "antenna-delay": Text(
+        "the ranges to {anchors:list} are {metres:.0f} m longer than the distances that they show along the way: antenna "
+        "delays were never set; that was taken off; set them in the radios",
+        sensor="radio",
+    ),
     "stamps-in-bursts": Text(
         "{readings} come in bursts of about {size:.0f} with one stamp, every {period:.2f} s: they were spread over the time "
         "since the previous burst; stamp each reading when it is made",

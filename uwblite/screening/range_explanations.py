@@ -22,6 +22,7 @@ from ..arrays import Bools, Floats, Ints
 from ..findings import Fact
 from ..problem.alternatives import EvidencePolicy
 from ..sensor_log import SensorLog, plausible
+from .units import LENGTHS
 
 
 class PathPolicy:
@@ -51,6 +52,8 @@ class PathPolicy:
     """Between the turns that are compared, rad."""
     rounds: int = 5
     """Of reweighting of the readings of a place, by errors of the middle scale."""
+    antenna_delay: float = 77.0
+    """Error of ranges where one of the two devices has no antenna delay, m: half of 513.48 ns (Decawave APS014, 2014)."""
     ridge: float = 1e-6
     """Added to normal equations: a robot that stands shows a distance only."""
 
@@ -99,6 +102,8 @@ def explained_by_ranges(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
     traces = _traces(log)
     if not traces:
         return log, []
+    log, delays = _without_antenna_delays(log, traces)
+    traces = _traces(log) if delays else traces
     late = _late(log, traces)
     is_late = late.log_odds > EvidencePolicy.very_strong
     moments = _at_moments(log, traces, to_compare=is_late)
@@ -109,8 +114,9 @@ def explained_by_ranges(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
         left = _at_moments(in_time, _traces(in_time), to_compare=True)
         # A clock that is off contradicts the path at many moments; set right, at fewer.
         if _most(left) <= _most(moments):
-            return in_time, [Fact.of(late.kind, **late.figures), *_facts(_with_names_undone(in_time, left), in_time)]
-    return log, _facts(_with_names_undone(log, moments), log)
+            facts = _facts(_with_names_undone(in_time, left), in_time)
+            return in_time, [*delays, Fact.of(late.kind, **late.figures), *facts]
+    return log, [*delays, *_facts(_with_names_undone(log, moments), log)]
 
 
 def _most(rows: Sequence[Explanation]) -> float:
@@ -163,6 +169,35 @@ def _traces(log: SensorLog) -> list[Trace]:
         stamps, values = ranges.stamps[own[first]], ranges.ranges[own[first]]
         found.append(Trace(ranges.anchor_ids[anchor], stamps, values, way[first], odometry.at(stamps)[:, :2]))
     return found
+
+
+def _without_antenna_delays(log: SensorLog, traces: Sequence[Trace]) -> tuple[SensorLog, list[Fact]]:
+    """Return the recording without errors of ranges by antenna delays that were never set, of anchors, the tag or both.
+
+    Along a stretch of the way ranges to a place far away change otherwise than those to one in the building; a rival is another
+    unit of all ranges.
+    """
+    assert log.ranges is not None
+    names, offsets = log.ranges.anchor_ids, PathPolicy.antenna_delay * np.array([0.0, 1.0, 2.0])
+    units = np.append(np.ones_like(offsets), list(LENGTHS.values()))
+    offsets = np.append(offsets, np.zeros(len(LENGTHS)))
+    likely = np.zeros((len(names), len(PathPolicy.noise), len(offsets)))
+    for own in _stretches(log, traces):
+        for trace in own:
+            ranges = units[:, None] * trace.ranges - offsets[:, None]
+            paths = np.broadcast_to(trace.places, (*ranges.shape, 2))
+            of_place = _best_place(paths, ranges, np.ones_like(ranges)) + len(trace.ranges) * np.log(units)
+            likely[names.index(trace.anchor)] += np.where(np.median(ranges, axis=1) > 0.0, of_place, -np.inf)
+    metres, others = np.split(likely.max(axis=1), [len(offsets) - len(LENGTHS)], axis=1)
+    shown = metres.max(axis=1) > metres[:, 0] - np.log(PathPolicy.fault) + EvidencePolicy.very_strong
+    delays = np.where(shown, offsets[metres.argmax(axis=1)], 0.0)
+    if not delays.any() or others.sum(axis=0).max() > metres.max(axis=1).sum():
+        return log, []
+    facts = [
+        Fact.of("antenna-delay", metres=delay, anchors=[names[a] for a in np.flatnonzero(delays == delay).tolist()])
+        for delay in np.unique(delays[delays > 0.0]).tolist()
+    ]
+    return replace(log, ranges=replace(log.ranges, ranges=log.ranges.ranges - delays[log.ranges.anchor])), facts
 
 
 def _late(log: SensorLog, traces: Sequence[Trace]) -> Explanation:

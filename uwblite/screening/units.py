@@ -17,7 +17,7 @@ _LONGEST_READING = 150.0
 """Largest usual reach of a lidar of this kind, m."""
 _ENOUGH = 10
 """Least number of readings for a test of the unit."""
-_LENGTHS = {"feet": 0.3048, "centimetres": 0.01, "millimetres": 0.001}
+LENGTHS = {"feet": 0.3048, "centimetres": 0.01, "millimetres": 0.001}
 _YARD, _SAME_UNIT = 0.9144, 0.05
 """m; and by how much, relatively, a factor that a map found may differ from that of a unit: ranges in yards came out as 1.09 to
 1.14, for wheels are off by a few percent by themselves."""
@@ -74,12 +74,12 @@ def _length(values: Floats, most: float, expected: float, what: str, words: str,
     usual = float(np.median(values)) if len(values) >= _ENOUGH else 0.0
     if usual <= most:
         return ""
-    unit = min("centimetres", "millimetres", key=lambda name: abs(np.log(usual * _LENGTHS[name] / expected)))
+    unit = min("centimetres", "millimetres", key=lambda name: abs(np.log(usual * LENGTHS[name] / expected)))
     return _other_unit(what, words.format(usual), unit, option)
 
 
 def _other_unit(what: str, usual: str, unit: str, option: str) -> str:
-    return f"{what} look like {unit}: the {usual}; write metres into the log (`{option}_unit={_LENGTHS[unit]:g}`)"
+    return f"{what} look like {unit}: the {usual}; write metres into the log (`{option}_unit={LENGTHS[unit]:g}`)"
 
 
 def _speeds(odometry: Odometry) -> Floats:
@@ -167,7 +167,7 @@ def refuse_other_ranges(change_by_way: float, lidar_by_wheels: float) -> None:
     """
     if lidar_by_wheels > 0.0 and abs(np.log(change_by_way / lidar_by_wheels)) < np.log(_OTHER_LENGTH):
         return
-    for name, unit in _LENGTHS.items():
+    for name, unit in LENGTHS.items():
         if abs(np.log(change_by_way * unit)) < np.log(_OTHER_LENGTH):
             usual = f"usual change would be {change_by_way:.3g} times the distance that the wheels count"
             raise DataError(_other_unit("the ranges", usual, name, "range"))
@@ -175,7 +175,7 @@ def refuse_other_ranges(change_by_way: float, lidar_by_wheels: float) -> None:
 
 def likely_unit(times: float) -> str:
     """Return words on what looks as if the robot drove so many times as far as its wheels count; '' where nothing does."""
-    foot = _LENGTHS["feet"]
+    foot = LENGTHS["feet"]
     units = [(1.0 / _YARD, f"ranges in yards would look like this (`range_unit={_YARD}`)")]
     units += [(foot, f"odometry in feet would look like this (`odometry_unit={foot}`)")]
     return next((f"; {words}" for unit, words in units if times > 0.0 and abs(np.log(times / unit)) < _SAME_UNIT), "")
