@@ -2,6 +2,7 @@
 
 import math
 import random
+from itertools import pairwise
 
 import pytest
 from emulators.kobuki_device import Create2Device
@@ -89,6 +90,11 @@ def test_it_asks_for_the_stream_and_follows_the_circle():
         late.append(abs(pose.stamp - at))
     assert max(errors) < 0.2 * 0.06 + 0.003
     assert max(late) < 0.003
+    # Speeds, over the time from frame to frame, which comes 2 ms of 15 late, are the way and the turn.
+    steps = [(math.dist((a.x, a.y), (b.x, b.y)), math.remainder(b.theta - a.theta, 2 * math.pi)) for a, b in pairwise(poses)]
+    way, turn = map(sum, zip(*steps, strict=True))
+    assert 0.015 * sum(pose.speed for pose in poses) == pytest.approx(way, rel=0.1)
+    assert 0.015 * sum(pose.turn_rate for pose in poses) == pytest.approx(turn, rel=0.1)
 
 
 def test_a_robot_that_fell_asleep_is_woken_and_its_gap_reported():

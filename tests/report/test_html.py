@@ -16,7 +16,7 @@ from uwblite.graph.graph import UnknownKey
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.map_result import OUTCOMES, CalibrationEstimate
-from uwblite.report.drawn_map import DrawnAnchor, DrawnMap, free_sides
+from uwblite.report.drawn_map import DrawnAnchor, DrawnMap, drawn_map, free_sides
 from uwblite.report.html import Heading, render
 
 FRAME = np.array([[-10.0, -10.0], [10.0, 10.0]])
@@ -259,3 +259,11 @@ def test_the_name_of_an_anchor_at_the_edge_has_room():
     text = render(replace(result, anchors=(far,)), Heading("run.log", "uwblite"))
     x, _, width, _ = map(float, re.search(r'class="map" viewBox="([^"]*)"', text)[1].split())
     assert x + width > 60.0 + 0.1 * width
+
+
+def test_every_recording_has_a_path_of_its_own():
+    result = small_result()
+    second = np.arange(len(result.stamps)) % 3 == 0
+    drawn = drawn_map(replace(result, recording=np.where(second, 1, 0)))
+    for path, own in zip(drawn.paths, (~second, second), strict=True):
+        np.testing.assert_array_equal(path, result.trajectory[own, :2])
