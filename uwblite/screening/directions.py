@@ -59,7 +59,7 @@ def laser_upright(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Fact]]:
 def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Fact]]:
     """Return the recording with the direction of the laser that the driving shows, where that is far from the given one."""
     way = [np.hypot(m[:, 0], m[:, 1]) for m in (pairs.lidar, pairs.wheels)]
-    clear = pairs.measured & (np.minimum(*way) > PairPolicy.clear[0]) & (np.abs(pairs.lidar[:, 2]) < _LEAST_TURNED)
+    clear = pairs.measured & (np.minimum(*way) > PairPolicy.clear) & (np.abs(pairs.lidar[:, 2]) < _LEAST_TURNED)
     if clear.sum() < PairPolicy.enough:
         return log, []
     by_wheels, by_lidar = (se2.as_complex(m[clear]) for m in (pairs.wheels, pairs.lidar))

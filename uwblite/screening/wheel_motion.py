@@ -48,8 +48,8 @@ class PairPolicy:
     """Factor between mean square distances of matches from which the better motion is shown; twice is clear."""
     moving: float = 0.03
     """Motion between the scans of a pair that is larger than noise, m and rad."""
-    clear: tuple[float, float] = (0.05, 0.1)
-    """Distance, m, and turn, rad, that are large enough for a ratio."""
+    clear: float = 0.05
+    """Distance that is large enough for a ratio and a direction, m."""
     related: float = 0.5
     """Correlation of the motions by two sensors that both work, at least."""
     enough: int = 12
@@ -135,13 +135,13 @@ class Pairs(Table):
     def unrelated(self) -> bool:
         """Whether the ways by lidar and wheels have nothing in common."""
         own = self.rows(self.measured)
-        return unrelated(own.wheels[:, :2], own.lidar[:, :2], PairPolicy.clear[0])
+        return unrelated(own.wheels[:, :2], own.lidar[:, :2], PairPolicy.clear)
 
     @property
     def way_ratio(self) -> float:
         """The way by the lidar / the way by the wheels; nan where there are too few clear motions."""
         own = self.rows(self.measured)
-        return lidar_by_wheels(own.wheels[:, :2], own.lidar[:, :2], PairPolicy.clear[0], _NAN)
+        return lidar_by_wheels(own.wheels[:, :2], own.lidar[:, :2], PairPolicy.clear, _NAN)
 
 
 def standing(odometry: Odometry, least: float = PairPolicy.least_stand) -> list[tuple[float, float]]:
