@@ -193,3 +193,16 @@ def test_rounds_that_are_numbered_are_missed(name):
     sent = zip(times, numbers, strict=True)
     actions = [a for t, n in sent for a in session.feed(BOARDS[name](epoch, n, 0), 0.1 * t)]
     assert [a.count for a in actions if isinstance(a, Lost)] == [7]
+
+
+@pytest.mark.parametrize(("every", "off"), [(1, 36000), (3, 0)])
+def test_rounds_are_missed_after_a_long_pause_and_on_a_link_that_loses_most(every, off):
+    """The board was off for an hour, or two of three lines are lost: it counts no slower for that."""
+    epoch = next(RoomWorld().epochs())
+    times = [*range(0, 360, every), *range(378, 420, every)]
+    later = [off * (t >= 180) for t in times]
+    session = open_device("uwb", "makerfabs-at:port")[0]
+    session.start(0.0)
+    sent = ((t + by, (t - 180 * (by > 0)) % 256) for t, by in zip(times, later, strict=True))
+    actions = [a for t, n in sent for a in session.feed(BOARDS["makerfabs-at"](epoch, n, 0), 0.1 * t)]
+    assert 18 + every - 1 in [a.count for a in actions if isinstance(a, Lost)]

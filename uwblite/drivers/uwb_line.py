@@ -199,7 +199,7 @@ def by_columns(columns: str, unit: float = 1.0, prefix: str = "") -> Parse:
 MOST_LEAP, NEAR = 100_000, 3
 """Rounds that may be lost together; rounds within which the next one must follow a leap, as a damaged digit leaps too."""
 FASTER = 2.0
-"""Times the mean rate at which rounds came, for those that are missing."""
+"""Times the mean rate at which the board counts rounds, for those that are missing."""
 OTHER_TAG = "line of a tag that was seen once"
 MUCH = 50
 """Rounds in a row without a range after which it is reported."""
@@ -219,8 +219,8 @@ class UwbDriver(LineDriver):
         self._first: Line | None = None
         """The line of a tag that was seen once."""
         self._round: int | None = None
-        self._rounds, self._begun, self._latest = 0, 0.0, 0.0
-        """Numbered rounds that came; s, arrival of the first and of the last."""
+        self._rounds, self._took, self._latest = 0, 0.0, 0.0
+        """Rounds between lines with neighbouring numbers, and the time that they took, s; s, arrival of the last line."""
         self._guard = RangeGuard(self.health)
 
     def time_of(self, content: Ranges | Refused) -> float | None:
@@ -266,11 +266,12 @@ class UwbDriver(LineDriver):
         """Return how many rounds were missed before the line before this one, by their numbers; 0 where the board restarted."""
         if line.round is None:
             return 0
-        before, pause, usual = self._round, stamp - self._latest, (self._latest - self._begun) / max(self._rounds - 1, 1)
-        self._begun = self._begun if self._rounds else stamp
-        self._round, self._rounds, self._latest = line.round, self._rounds + 1, stamp
+        before, pause, usual = self._round, stamp - self._latest, self._took / max(self._rounds, 1)
+        self._round, self._latest = line.round, stamp
         step = 1 if before is None else line.round - before
         step = step % line.modulus if line.modulus else step
+        if before is not None and 0 < step <= NEAR:
+            self._rounds, self._took = self._rounds + step, self._took + pause
         # A number that wraps leaps ahead where the board restarted, too, but there was no time for so many rounds.
         possible = step <= MOST_LEAP and (not line.modulus or (step - NEAR) * usual <= FASTER * pause)
         leap, self._leap = self._leap, step - 1 if step > 1 and possible else 0
