@@ -130,6 +130,14 @@ def test_an_anchor_at_another_optimum_is_put_where_its_ranges_have_it(given):
     assert (warned(task.stages), doubted(task.stages)) == ([], [])
 
 
+def test_an_anchor_that_was_moved_since_an_earlier_map_stays_told():
+    """What is said of its given place is no part of a decision that is made again."""
+    estimate, task = planted(moves=[(0, 1, (-2.0, 1.5), 70.0, 70.0)])
+    task.stages.note("moved-anchor", anchor="C", distance=2.0)
+    decide_places(decide_places(estimate, task), task)
+    assert [w.figures["anchor"] for w in warned(task.stages)] == ["C", "B"]
+
+
 @pytest.mark.parametrize("held", [True, False])
 def test_an_anchor_that_is_moved_has_two_places(held):
     estimate, task = planted(moves=[(0, 1, (-2.0, 1.5), 70.0, 70.0)], held=held, height=None if held else 0.0)

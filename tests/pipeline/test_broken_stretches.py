@@ -161,7 +161,7 @@ def test_an_anchor_that_seemed_moved_along_a_path_since_mended_has_one_place():
         estimate, graph=graph, anchor_ids=(*estimate.anchor_ids, f"{estimate.anchor_ids[1]}@2"),
         ranges=replace(ranges, anchor=np.where(late, 4, ranges.anchor)), bootstrap=BootstrapResult(graph, yes, ((),) * 5, ~yes),
     )  # fmt: skip
-    task.stages.note("moved-anchor", anchor=estimate.anchor_ids[1], distance=2.9)
+    task.stages.note("moved-anchor", anchor=estimate.anchor_ids[1], distance=2.9, recording=1, new_id="2")
     found = replace_broken_stretches(split, task)
     assert found.anchor_ids == estimate.anchor_ids
     assert [fact.kind for fact in task.stages.facts if fact.kind != "clock-offset"] == []

@@ -24,8 +24,13 @@ from .broken_steps import BreakPolicy, RadioTrack, radio_tracks, without_moves_o
 from .estimate import Estimate, Task
 from .radio_stages import with_range_noise, with_selected_priors
 
-MOVES = ("moved-anchor", "path-displaced")
-"""Kinds of what is said of anchors' places: of the last decision, along the path as it was then."""
+
+def of_places(fact: Fact) -> bool:
+    """Return whether a fact tells what was decided on anchors' places, along the path as it was then.
+
+    An anchor that is not where the user has it was moved before any recording.
+    """
+    return fact.kind in ("moved-anchor", "path-displaced") and "recording" in fact.figures
 
 
 def decide_places(estimate: Estimate, task: Task) -> Estimate:
@@ -44,7 +49,7 @@ def decide_places(estimate: Estimate, task: Task) -> Estimate:
             estimate = with_range_noise(candidate, task.config)
             break
         estimate = _reoptimised(candidate, task)
-    task.stages.restate(MOVES, facts)
+    task.stages.restate(of_places, facts)
     if estimate is not first:
         task.stages.end("places of anchors", places=len(estimate.anchor_ids))
     return estimate

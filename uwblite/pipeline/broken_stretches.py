@@ -19,7 +19,7 @@ from ..lidar.scan_to_scan import TrackingConfig
 from ..odometry.slips import log_densities, with_slips
 from ..problem.solution import rough
 from . import lidar_stages, surface_adjustment
-from .anchor_places import MOVES, decide_places
+from .anchor_places import decide_places, of_places
 from .broken_steps import BreakPolicy, BrokenStep, broken_steps, range_evidence
 from .estimate import Estimate, Task
 from .radio_stages import with_range_noise
@@ -34,7 +34,7 @@ def replace_broken_stretches(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate with broken steps of the lidar's path left to wheels and radio where that is more probable."""
     if estimate.scans is None or estimate.ranges is None or estimate.joint is None or estimate.rests_on_ranges:
         return estimate
-    said = [fact.kind for fact in task.stages.facts if fact.kind in MOVES]
+    said = [fact.kind for fact in task.stages.facts if of_places(fact)]
     if not said and not len(_suspects(estimate, task)):
         return estimate
     wheels, found, first = estimate.odometry, list[Fact](), estimate

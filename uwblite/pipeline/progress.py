@@ -1,6 +1,6 @@
 """Summaries of the stages, facts for the rules, and the caller's progress callback and clock."""
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from ..errors import Cancelled
@@ -62,9 +62,9 @@ class Stages:
         """Add a fact, of which the rule of its kind (assessment/facts.py) makes a finding."""
         self.facts.append(Fact(kind, figures))
 
-    def restate(self, kinds: Collection[str], facts: Iterable[Fact]) -> None:
-        """Put facts in place of those of some kinds, of a question that is decided again."""
-        self.facts = [*(fact for fact in self.facts if fact.kind not in kinds), *facts]
+    def restate(self, of_question: Callable[[Fact], bool], facts: Iterable[Fact]) -> None:
+        """Put facts in place of those of a question that is decided again."""
+        self.facts = [*(fact for fact in self.facts if not of_question(fact)), *facts]
 
     def end(self, stage: str, **figures: object) -> None:
         """Close a stage; its figures are rounded."""
