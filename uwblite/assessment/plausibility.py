@@ -251,7 +251,7 @@ def _lidar_by_wheels(recording: Recording, graph: Graph) -> float:
         return float("nan")
     wheels, path = (se2.between(p[:-1], p[1:])[:, :2] for p in (recording.frames.odometry, graph.poses[recording.rows]))
     by_path = lidar_by_wheels(wheels, path, PairPolicy.clear, screening.lidar_by_wheels)
-    return min(screening.lidar_by_wheels, by_path, key=lambda ratio: abs(np.log(ratio)))
+    return min(screening.lidar_by_wheels, by_path, key=lambda ratio: abs(ratio - 1.0))
 
 
 def check_handedness(estimate: Estimate, task: Task) -> Iterator[Finding]:
