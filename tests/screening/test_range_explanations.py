@@ -65,6 +65,16 @@ def test_antenna_delays_that_were_never_set_are_taken_off(anchors, metres):
     np.testing.assert_allclose(shifted.ranges.ranges, log.ranges.ranges, atol=0.5)
 
 
+def test_readings_of_zero_have_no_antenna_delay():
+    """A radio that reports zero has missed its partner."""
+    log = late_by(0.0)
+    missed = np.arange(len(log.ranges.ranges)) % 7 == 0
+    ranges = np.where(missed, 0.0, log.ranges.ranges + 77.0)
+    shifted, (fact,) = explained_by_ranges(replace(log, ranges=replace(log.ranges, ranges=ranges)))
+    assert fact.kind == "antenna-delay"
+    np.testing.assert_allclose(shifted.ranges.ranges, np.where(missed, 0.0, log.ranges.ranges), atol=0.5)
+
+
 def test_a_sound_recording_has_nothing_to_explain():
     log = late_by(0.0)
     assert explained_by_ranges(log) == (log, [])

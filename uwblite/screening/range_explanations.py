@@ -21,7 +21,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..findings import Fact
 from ..problem.alternatives import EvidencePolicy
-from ..sensor_log import SensorLog, plausible
+from ..sensor_log import SHORTEST_RANGE, SensorLog, plausible
 from .units import LENGTHS
 
 
@@ -197,7 +197,10 @@ def _without_antenna_delays(log: SensorLog, traces: Sequence[Trace]) -> tuple[Se
         Fact.of("antenna-delay", metres=delay, anchors=[names[a] for a in np.flatnonzero(delays == delay).tolist()])
         for delay in np.unique(delays[delays > 0.0]).tolist()
     ]
-    return replace(log, ranges=replace(log.ranges, ranges=log.ranges.ranges - delays[log.ranges.anchor])), facts
+    # A reading of zero is that of a partner who was missed.
+    missed = np.abs(log.ranges.ranges) <= SHORTEST_RANGE
+    ranges = log.ranges.ranges - np.where(missed, 0.0, delays[log.ranges.anchor])
+    return replace(log, ranges=replace(log.ranges, ranges=ranges)), facts
 
 
 def _late(log: SensorLog, traces: Sequence[Trace]) -> Explanation:
