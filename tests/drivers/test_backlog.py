@@ -120,6 +120,17 @@ def test_what_is_no_frame_keeps_its_place_and_waits_only_behind_frames():
     assert Backlog().take("other", 1.0, None) == ["other"]
 
 
+def test_a_frame_before_bytes_that_are_all_damaged_does_not_wait_for_ever():
+    backlog, out = Backlog(), []
+    for time in (0.0, 0.1, 9.0):
+        out += backlog.take(Frame(time, 0), time, 0.1)
+    assert [frame.stamp for frame in out] == [0.0, 0.1]
+    for k in range(300):
+        out += backlog.take(CUT, 9.0 + 0.01 * k, None)
+    assert [event.stamp for event in out if isinstance(event, Frame)] == [0.0, 0.1, 9.0]
+    assert (out.count(CUT), backlog.deadline()) == (300, None)
+
+
 def test_many_frames_do_not_wait_for_ever(monkeypatch):
     monkeypatch.setattr("uwblite.drivers.backlog.MOST", 4096)
     backlog, count = Backlog(), 0

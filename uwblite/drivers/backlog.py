@@ -82,8 +82,8 @@ class Backlog:
         if not self._waiting:
             return None
         frames = [held for held in self._waiting[-MEMORY:] if held.spacing is not None]
-        if not frames:
-            return None
+        if not frames:  # so much else came behind them
+            return -math.inf
         spacing = max(frames[-1].spacing or 0.0, LEAST_PAUSE / MEMORY)
         many = max(FAST, math.ceil(FAST / LOOK * LEAST_PAUSE / spacing))
         return float(frames[-many:][0].event.stamp + min(many * spacing * LOOK / FAST, MOST_LOOK))
