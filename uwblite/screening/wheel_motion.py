@@ -275,6 +275,8 @@ def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> lis
     own, lasting = pairs.rows(pairs.measured), PairPolicy.lasting
     if len(own.start) < 2 * PairPolicy.enough:
         return []
+    if pairs.unrelated:
+        return [Fact.of("wheels-against-lidar", start=start, stretches=[], slips=False)]
     parts = slice(0, 2), slice(2, None)
     way, turn = (lidar_by_wheels(own.wheels[:, p], own.lidar[:, p], PairPolicy.moving, 1.0) for p in parts)
     wheels = own.wheels * np.array([way, way, turn])
@@ -296,9 +298,7 @@ def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> lis
     runs = [(a, b) for a, b in runs_of(smooth) if own.end[b - 1] - own.start[a] >= lasting]
     slips = all(max(np.mean(of[a:b]) for of in more) > 0.5 and b + lasting // 2 < len(smooth) for a, b in runs)
     stretches = [(float(own.start[a]), float(own.end[b - 1])) for a, b in runs]
-    stretches = [] if pairs.unrelated else stretches
-    fact = Fact.of("wheels-against-lidar", start=start, stretches=stretches, slips=slips)
-    return [fact] if stretches or pairs.unrelated else []
+    return [Fact.of("wheels-against-lidar", start=start, stretches=stretches, slips=slips)] if stretches else []
 
 
 def _turn_otherwise(lidar: Floats, wheels: Floats) -> Bools:
