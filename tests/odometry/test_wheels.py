@@ -266,6 +266,26 @@ def test_noise_does_not_draw_the_wheels_scale(calibration):
     assert solved.calibration.get("heading_scale") == pytest.approx(turn, abs=4 * reach[2])
 
 
+@pytest.mark.parametrize("scale", [0.04, -0.05])
+def test_sideways_motion_that_wheels_do_not_count_is_no_scale(scale):
+    """A robot that is displaced to the side by as much as it drives ahead, whose wheels count its way without noise: the scale
+    comes out within four standard deviations of what was planted."""
+    rng = np.random.default_rng(8)
+    stamps, truth = wander(rng, 600.0)
+    frames = select(Odometry(stamps, truth), KeyframeConfig())
+    names = unknowns(sideways_priors(Odometry(stamps, truth), CalibrationConfig()), (), np.zeros(0, dtype=bool))
+    exact = wheel_edges(frames, OdometryNoiseConfig(distance=0.3, heading_per_metre=0.5), block(names))
+    sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
+    aside = np.column_stack([np.zeros(len(exact)), sigma[:, 1] * rng.standard_normal(len(exact)), np.zeros(len(exact))])
+    poses = se2.chain(truth[frames.index[0]], se2.compose(exact.motion, aside))
+    wheels = replace(exact, motion=exact.motion / [1 + scale, 1 + scale, 1.0])
+    graph = Graph(poses, calibration=block(names), fixed_poses=np.ones(len(frames), dtype=bool))
+    graph = replace(graph, fixed_calibration=~graph.calibration.of_kinds("odometry_scale"))
+    solved, _ = optimize(graph.with_edges(replace(wheels, kernel=SQUARED)))
+    reach = sigma[0, 0] / np.sqrt((wheels.motion[:, 0] ** 2).sum())
+    assert solved.calibration.get("odometry_scale") == pytest.approx(scale, abs=4 * reach)
+
+
 @pytest.mark.parametrize(("sideways", "counted"), [(0.0, False), (0.02, False), (0.045, True), (-0.4, True)])
 def test_ways_to_the_side_are_calibrated_where_the_odometry_counts_some(sideways, counted):
     """A robot in curves, whose readings a second apart hold arcs and not ways to the side, drives none."""

@@ -10,9 +10,9 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, Shape
+from ..arrays import Bools, Floats, Ints, Shape
 from ..config import documented
-from .calibration import LASER, ODOMETRY, TURNING, WHEELS
+from .calibration import LASER, ODOMETRY, OMNI, TURNING, WHEELS
 from .graph import Block, Edges, Graph, Linearization
 
 _LEAST_SCALE = 0.1
@@ -94,10 +94,11 @@ class OdometryEdges(Edges):
     """Motion from pose i to pose j by odometry, corrected by its calibration.
 
     With distance scale 1 + s and heading error delta = k dtheta + b length + g duration, the measured motion
-    (dx, dy, dtheta) is taken as ``(R(delta / 2) (1 + s) (dx, dy), dtheta + delta)``. The error is divided by 1 + s in x and y
-    and by 1 + k in heading: as that of the raw odometry. Else noise would bias s and k towards smaller motions (errors in
-    variables). It is the error in the middle of the step: a heading error anywhere along the step displaces the end, on
-    average, by half the distance times the error, and the remaining error across is independent of it.
+    (dx, dy, dtheta) is taken as ``(R(delta / 2) (1 + s) (dx, dy), dtheta + delta)``. The error is divided by 1 + s ahead and by
+    1 + k in heading: as that of the raw odometry. Else noise would bias s and k towards smaller motions (errors in variables).
+    So is an error to the side where wheels count such motion. Elsewhere it is a motion that they do not count, and would bias s
+    towards larger ones. It is the error in the middle of the step: a heading error anywhere along the step displaces the end,
+    on average, by half the distance times the error, and the remaining error across is independent of it.
 
     The wheels turn about the point (-p, 0) of the base, and measure the motion of a frame there. To their motion v to the left
     ``v q + u r`` is added and to their motion u ahead ``v w``, both in the frame in the middle of the step.
@@ -127,9 +128,14 @@ class OdometryEdges(Edges):
         return se2.compose(turning, se2.compose(self._corrected(graph)[0], se2.inverse(turning)))
 
     def own_scale(self, graph: Graph) -> Floats:
-        """Return by what (e, 3) an error of the corrected motion is divided to be one of the raw odometry."""
+        """Return by what (e, 3) an error of the corrected motion, ahead, to the side and in heading, is divided."""
         s, k = np.append(graph.calibration.values, 0.0)[self.calibration[:, :2]].T
-        return np.maximum(np.stack([1.0 + s, 1.0 + s, 1.0 + k], axis=1), _LEAST_SCALE)
+        return np.maximum(np.stack([1.0 + s, 1.0 + s * self._count_sideways, 1.0 + k], axis=1), _LEAST_SCALE)
+
+    @property
+    def _count_sideways(self) -> Bools:
+        """(e,) whether the wheels count motion to the side, which then has a scale of its own."""
+        return np.asarray(self.calibration[:, WHEELS.index(OMNI[0])] >= 0)
 
     @property
     def end_sqrt_information(self) -> Floats:
@@ -169,7 +175,8 @@ class OdometryEdges(Edges):
         si, sj = (se2.compose(graph.poses[k], turning).T for k in (self.i, self.j))
         z, direction, s = self._corrected(graph)
         stretch = self.own_scale(graph)
-        error = _Relative(z, self.end_sqrt_information / stretch[:, None, :], si, sj)
+        root = self.end_sqrt_information / stretch[:, None, :]
+        error = _Relative(z, root, si, sj)
         blocks: list[Block] = [*error.by_poses(self.i, self.j, xi, xj)]
         used = graph.free_columns(self.calibration)
         if used.any():
@@ -178,10 +185,12 @@ class OdometryEdges(Edges):
             axes, (mx, my) = error.axes, error.m
             shift = error.along(mx, my)
             # A scale clamped at its least value no longer changes the divisor of errors.
-            across, around = np.where(stretch[:, 1:] > _LEAST_SCALE, 1.0 / stretch[:, 1:], 0.0).T
-            by_scale = -axes[0] * nx - axes[1] * ny - shift * across
+            shrinks = np.where(stretch > _LEAST_SCALE, 1.0 / stretch, 0.0)
+            shrinks[:, 1] *= self._count_sideways
+            off = se2.rotate(-si[2] - z[:, 2], np.stack([mx, my], axis=1)) * shrinks[:, :2]
+            by_scale = -axes[0] * nx - axes[1] * ny - np.einsum("eij,ej->ie", root[:, :, :2], off)
             by_delta = axes[0] * (my + half * ny) - axes[1] * (mx + half * nx) - axes[2]
-            by_turn = by_delta * self.motion[:, 2] - (error.residuals - shift) * around
+            by_turn = by_delta * self.motion[:, 2] - (error.residuals - shift) * shrinks[:, 2]
             columns = [by_scale, by_turn, by_delta * self.length, by_delta * self.duration]
             if used[len(ODOMETRY) :].any():
                 cos, sin = (before - after for before, after in zip(se2.cos_sin(xi[2]), se2.cos_sin(xj[2]), strict=True))
