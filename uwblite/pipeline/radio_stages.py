@@ -184,10 +184,11 @@ def evidence_against(one: Estimate, other: Estimate, config: MappingConfig) -> f
     """Return by how much the logarithm of the evidence of one estimate of a recording is greater than that of another.
 
     The noise of the ranges was learnt under either, so that the ranges count with their normalised densities; both with the
-    same number of independent ranges, for errors that last are counted once.
+    same number of independent ranges, for errors that last are counted once: the geometric mean of either noise's numbers, since
+    a number that is known to an order of magnitude is a scale.
     """
     (rest, density, share), (rest_of_other, density_of_other, share_of_other) = (_evidence(e, config) for e in (one, other))
-    common = 0.5 * (share + share_of_other) * ((share > 0.0) & (share_of_other > 0.0))
+    common = np.sqrt(share * share_of_other)
     ranges = float(common @ density) - float(common @ density_of_other)
     return rest - rest_of_other + ranges
 
