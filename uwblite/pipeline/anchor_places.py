@@ -95,8 +95,8 @@ def _apply_places(
     recording = task.recordings.of_keyframe[ranges.pose]
     ids, anchors, anchor = list(estimate.anchor_ids), list(estimate.graph.anchors), ranges.anchor.copy()
     weights, source, hypotheses = ranges.own_weights.copy(), list(range(len(ids))), list(bootstrap.hypotheses)
-    # Along a path that follows the ranges, or where the user says where anchors are, one place stays.
-    replaced = not estimate.rests_on_ranges and not task.constraints.anchors
+    # Along a path that follows the ranges, or where the user says something of anchors, one place stays.
+    replaced = not (estimate.rests_on_ranges or task.constraints.anchors or task.constraints.distances)
     for radio, explanation in zip(radios, explanations, strict=True):
         if len(radio.numbers) == len(explanation.found) == 1:
             if replaced and _likelier(radio, explanation, anchors[radio.numbers[0]]):
