@@ -184,8 +184,8 @@ def evidence_against(one: Estimate, other: Estimate, config: MappingConfig) -> f
     """Return by how much the logarithm of the evidence of one estimate of a recording is greater than that of another.
 
     The noise of the ranges was learnt under either, so that the ranges count with their normalised densities; both with the
-    same number of independent ranges, for errors that last are counted once: the geometric mean of either noise's numbers, since
-    a number that is known to an order of magnitude is a scale.
+    same number of independent ranges, for errors that last are counted once: the geometric mean of either noise's numbers, as
+    such a number is known to an order of magnitude only.
     """
     (rest, density, share), (rest_of_other, density_of_other, share_of_other) = (_evidence(e, config) for e in (one, other))
     common = np.sqrt(share * share_of_other)
