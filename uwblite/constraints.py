@@ -136,6 +136,11 @@ class Constraints:
         """Whether they determine the frame of the map."""
         return bool(self.anchors or self.poses)
 
+    @property
+    def of_anchors(self) -> bool:
+        """Whether they say where anchors are, or how far apart."""
+        return bool(self.anchors or self.distances)
+
     def allowed(self, clock: "Clock", i: Ints, j: Ints) -> Bools:
         """Return which pairs (n,) of the clock's poses may be matched with each other."""
         allowed = np.ones(len(i), dtype=bool)

@@ -1,9 +1,10 @@
-"""Where each anchor stood, and when: decided once, within recordings and between them, on a path that is known well enough.
+"""Where each anchor stood, and when: decided within recordings and between them, on a path that is known well enough.
 
 Each radio's ranges are explained by places and intervals (radio/place_intervals.py); broken steps of the path compete with
 moves that begin together (broken_steps.py). Where ranges alone hold the path, all is solved with the places found, and these
-are decided on the path that results, until they stay. Anchors that are new or were taken away between recordings have ranges
-in some of them, though others drove in their reach.
+are decided on the path that results, until they stay. Where the path may have been torn they are decided once more when it is
+mended (broken_stretches.py). Anchors that are new or were taken away between recordings have ranges in some of them, though
+others drove in their reach.
 """
 
 from collections.abc import Iterator, Sequence
@@ -96,7 +97,7 @@ def _apply_places(
     ids, anchors, anchor = list(estimate.anchor_ids), list(estimate.graph.anchors), ranges.anchor.copy()
     weights, source, hypotheses = ranges.own_weights.copy(), list(range(len(ids))), list(bootstrap.hypotheses)
     # Along a path that follows the ranges, or where the user says something of anchors, one place stays.
-    replaced = not (estimate.rests_on_ranges or task.constraints.anchors or task.constraints.distances)
+    replaced = not (estimate.rests_on_ranges or task.constraints.of_anchors)
     for radio, explanation in zip(radios, explanations, strict=True):
         if len(radio.numbers) == len(explanation.found) == 1:
             if replaced and _likelier(radio, explanation, anchors[radio.numbers[0]]):

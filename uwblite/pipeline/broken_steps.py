@@ -68,8 +68,7 @@ def radio_tracks(estimate: Estimate, task: Task) -> list[RadioTrack]:
     ranges, ids, config = estimate.ranges, estimate.anchor_ids, task.config
     assert ranges is not None
     # Prior knowledge of the user refers to anchors by their present numbers.
-    tied = bool(task.constraints.anchors or task.constraints.distances)
-    names = [name if tied or radio_name(name) not in ids else radio_name(name) for name in ids]
+    names = [name if task.constraints.of_anchors or radio_name(name) not in ids else radio_name(name) for name in ids]
     recording, positions = task.recordings.of_keyframe[ranges.pose], ranges.tag_positions(estimate.graph.poses)
     used = ranges.alive & estimate.placed[ranges.anchor]
     values = np.append(estimate.graph.calibration.values, 0.0)[ranges.calibration]

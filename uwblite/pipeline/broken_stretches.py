@@ -73,14 +73,14 @@ def _off(estimate: Estimate) -> Bools:
 
 
 def _suspects(estimate: Estimate, task: Task) -> Ints:
-    """Return the keyframe at which each stretch that contradicts the odometry begins."""
+    """Return the keyframe at which each stretch of steps that contradict, or may, begins (see _off)."""
     ends = estimate.odometry.j[_off(estimate)]
     later = np.diff(task.recordings.stamps[ends], prepend=-np.inf) > _AROUND
     return np.asarray(ends[later], dtype=np.intp)
 
 
 def _stretch(estimate: Estimate, task: Task, begin: int) -> tuple[int, int]:
-    """Return the first and last keyframe of the steps that contradict around a broken one, which ends at a keyframe."""
+    """Return the first and last keyframe of the steps that are off (see _off) around a broken one, which ends at a keyframe."""
     stamps, of = task.recordings.stamps, task.recordings.of_keyframe
     ends = np.append(estimate.odometry.j[_off(estimate)], begin)
     ends = np.unique(ends[of[ends] == of[begin]])
