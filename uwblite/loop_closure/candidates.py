@@ -9,7 +9,6 @@ makes the others more certain.
 
 from collections.abc import Set
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -26,25 +25,24 @@ Tried = set[tuple[int, int, bool]]
 """Target, source, and whether they were searched, of pairs that were tried."""
 
 
-@dataclass(frozen=True, slots=True)
 class CandidatePolicy:
     """Which pairs are worth a match."""
 
-    sigmas: ClassVar[float] = OUTLIER
+    sigmas: float = OUTLIER
     """Standard deviations within which the truth is looked for."""
-    shared: ClassVar[float] = 0.25
+    shared: float = 0.25
     """Least share of its surface that the smaller of two sub-maps should have in common with the other."""
-    cells: ClassVar[int] = 5
+    cells: int = 5
     """Surface of a sub-map, in cells, up to which it shows no place."""
-    length: ClassVar[float] = 30.0
+    length: float = 30.0
     """Travelled distance of a stretch, m: it contains several doors or pillars, and the drift of a chain of scans stays
     within the gate of the final matching. Each begins in the middle of the one before."""
-    wider: ClassVar[float] = 2.0
+    wider: float = 2.0
     """Factor on the standard deviations of a chain of steps: a bias that following steps share adds up along the way, and the
     covariance contains none (twice the stated heading in a hospital)."""
-    never: ClassVar[float] = 1e-4
+    never: float = 1e-4
     """Probability of an overlap up to which stretches are not tried; the covariance may be too small, but not by so much."""
-    at_once: ClassVar[int] = 40
+    at_once: int = 40
     """Pairs of stretches tried before the graph is solved again."""
 
 

@@ -4,8 +4,6 @@ Doors and pillars repeat. Closures that confuse one with the next agree with eac
 the two ends of the stretch that they move. A wheel may slip once; it does not slip back by the same distance metres later.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -17,20 +15,19 @@ from ..lidar.visibility import VisibilityPolicy
 from .closures import LoopClosureConfig
 
 
-@dataclass(frozen=True, slots=True)
 class TiePolicy:
     """Scan edges that fix a step, and jumps of the odometry where none does."""
 
-    near: ClassVar[int] = 4
+    near: int = 4
     """Most keyframes that a scan edge of the same visit spans."""
-    another_visit: ClassVar[float] = VisibilityPolicy.apart
+    another_visit: float = VisibilityPolicy.apart
     """Travelled distance between two visits, m."""
-    clear: ClassVar[tuple[float, ...]] = (0.05, 0.05, 0.02)
+    clear: tuple[float, ...] = (0.05, 0.05, 0.02)
     """Standard deviations, m, m, rad, up to which a scan edge fixes a direction; none fixes the way along a bare corridor."""
-    jump: ClassVar[float] = 0.5
-    torn: ClassVar[float] = 10.0
+    jump: float = 0.5
+    torn: float = 10.0
     """m, and standard deviations, from which an error of one step of the odometry is more than noise."""
-    made_good: ClassVar[float] = 0.3
+    made_good: float = 0.3
     """Share of a jump that may remain after the opposite jump."""
 
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import ClassVar
 
 import numpy as np
 
@@ -25,19 +24,18 @@ from .closures import LoopClosureConfig
 from .parallel import batches, in_order
 
 
-@dataclass(frozen=True, slots=True)
 class MatchingPolicy:
     """Search for the places of candidates."""
 
-    least_turn: ClassVar[float] = 0.1
+    least_turn: float = 0.1
     """Least half-width of a search, rad."""
-    many_places: ClassVar[int] = 20
+    many_places: int = 20
     """Places found by a wide search that are matched before one is chosen: along a corridor the walls fit at many places."""
-    same_place: ClassVar[float] = 0.3
+    same_place: float = 0.3
     """Matches nearer to each other than this, m and rad, are one place."""
-    finer: ClassVar[float] = 1.5
+    finer: float = 1.5
     """Factor by which the headings of a wide search are closer."""
-    extent: ClassVar[float] = 0.95
+    extent: float = 0.95
     """Share of the points of a cloud that its extent contains: those that are far are few."""
 
 

@@ -8,7 +8,6 @@ may exclude.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import ClassVar
 
 import numpy as np
 
@@ -23,17 +22,16 @@ from ..sensor_log.sensors import radio_name
 from .estimate import Estimate, Task
 
 
-@dataclass(frozen=True, slots=True)
 class BreakPolicy:
     """What is known beforehand of a step at which the path is torn, and how it is sought."""
 
-    broken: ClassVar[float] = 0.1
+    broken: float = 0.1
     """Probability that a recording's path has one."""
-    size: ClassVar[float] = 1.0
+    size: float = 1.0
     """Standard deviation of the error of such a step, m and rad."""
-    rounds: ClassVar[int] = MovePolicy.laps
+    rounds: int = MovePolicy.laps
     """Most solutions of a path that ranges hold; two are usual."""
-    near: ClassVar[int] = 3
+    near: int = 3
     """Ranges by which the time of a change may be off."""
 
 

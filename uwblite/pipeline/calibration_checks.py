@@ -5,8 +5,7 @@ unit of the odometry; and the offset of the lidar's clock, which must be the sam
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import softmax
@@ -36,17 +35,16 @@ TOLERANCE = 0.004
 then costs 0.07 degrees."""
 
 
-@dataclass(frozen=True, slots=True)
 class TurningPolicy:
     """Offsets of a lidar from the place that is given, and whether wheels that slip in turns cause them."""
 
-    small: ClassVar[float] = 0.01
+    small: float = 0.01
     """m; a mounting, or the origin of a base, is not known better than this."""
-    by_tape: ClassVar[float] = 0.03
+    by_tape: float = 0.03
     """Standard deviation of a mounting that is given and right, m."""
-    wrong_frame: ClassVar[float] = 0.1
+    wrong_frame: float = 0.1
     """Share of given mountings that belong to another robot or frame, and are off by the setting `laser_offset`."""
-    slips: ClassVar[float] = 0.5
+    slips: float = 0.5
     """Prior odds of a robot that slips in turns against one that does not."""
 
 

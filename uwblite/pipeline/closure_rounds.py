@@ -1,8 +1,7 @@
 """Rounds of loop closing: sub-maps, candidates, matches, second optimisation, until nothing new is found."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,17 +21,16 @@ from .mapping_config import MappingConfig
 from .progress import Stage, solver_figures
 
 
-@dataclass(frozen=True, slots=True)
 class RoundPolicy:
     """Rounds of loop closing."""
 
-    per_stretch: ClassVar[int] = 3
+    per_stretch: int = 3
     """Sub-maps in half a stretch."""
-    bent: ClassVar[float] = 0.01
+    bent: float = 0.01
     """How far, m, closures may bend sub-maps, rms, before these are made again: an eighth of the cells that they average."""
-    few: ClassVar[float] = 0.05
+    few: float = 0.05
     """Share of the closures up to which new ones change nothing."""
-    wide_rounds: ClassVar[int] = 12
+    wide_rounds: int = 12
     """Rounds of searching among long stretches, at most; a bound on the time where no loop closes."""
 
 

@@ -11,7 +11,7 @@ all these edges together have the weight of the one measurement.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,27 +35,26 @@ from .estimate import Estimate, Task
 from .lidar_stages import refine_jointly, solve_by_own_errors
 
 
-@dataclass(frozen=True, slots=True)
 class GivenPolicy:
     """When places agree with what is given, and which clouds see a landmark."""
 
-    gate: ClassVar[float] = CandidatePolicy.sigmas
+    gate: float = CandidatePolicy.sigmas
     """Standard deviations within which a place or a distance agrees."""
-    unsure: ClassVar[float] = 0.6
+    unsure: float = 0.6
     """m, more of a first estimate, whose biases are not yet known well."""
-    moved: ClassVar[float] = 4.0
+    moved: float = 4.0
     """Standard deviations beyond which an anchor of an earlier map counts hardly: the scale of its kernel."""
-    heading: ClassVar[float] = 1e-4
+    heading: float = 1e-4
     """rad; standard deviation of a heading that is fixed."""
-    near: ClassVar[float] = 0.4
+    near: float = 0.4
     """m; points count as the landmark's when they lie so near to its place, or to the rim of its column."""
-    least_points: ClassVar[int] = 3
+    least_points: int = 3
     """Of a cloud, that make an observation."""
-    one_visit: ClassVar[float] = 3.0
+    one_visit: float = 3.0
     """m; observations belong to one visit while less than this is travelled between two."""
-    visits: ClassVar[int] = 4
+    visits: int = 4
     """Visits used of a landmark, those with most points."""
-    noise: ClassVar[float] = 0.05
+    noise: float = 0.05
     """m, of a map's points on a column: the cells of the search, of which a fit takes points of four and then of two."""
 
 

@@ -1,7 +1,6 @@
 """The last stages: every measurement in one graph, and the occupancy grid along its trajectory."""
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,17 +31,16 @@ from .recordings import Recording
 from .surface_adjustment import for_covariances
 
 
-@dataclass(frozen=True, slots=True)
 class FinalPolicy:
     """What the finished estimate states."""
 
-    large_grid: ClassVar[int] = 5_000_000
+    large_grid: int = 5_000_000
     """Cells from which on a grid's memory is announced."""
-    along: ClassVar[int] = 60
+    along: int = 60
     """Poses along the trajectory whose joint covariance represents the whole trajectory."""
-    shortest: ClassVar[float] = 0.05
+    shortest: float = 0.05
     """s; shortest step whose variance grows in proportion to its time."""
-    fastest: ClassVar[float] = 1.0
+    fastest: float = 1.0
     """m/s and rad/s, at which a robot with wheels that measure nothing moves at most."""
 
 

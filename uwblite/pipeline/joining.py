@@ -8,7 +8,6 @@ the rigid motion into the other frame free, and what is left shows an anchor tha
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -31,22 +30,21 @@ Pairs = list[tuple[int, int]]
 """Number of an anchor in one set of places, and in the other."""
 
 
-@dataclass(frozen=True, slots=True)
 class JoiningPolicy:
     """Agreement of the places that recordings give to anchors."""
 
-    systematic: ClassVar[float] = 0.25
+    systematic: float = 0.25
     """Standard deviation of what NLOS and biases, not yet known well, add to the distance between two first places, m."""
-    largest: ClassVar[float] = 5.0
+    largest: float = 5.0
     """m; an anchor whose first place is less sure, or open, still has to lie within some metres to join in."""
-    moved: ClassVar[float] = 20.0
+    moved: float = 20.0
     """Decrease of chi2 without an anchor (2 degrees of freedom) from which on it was moved: 5e-5 by chance, the rest for
     errors that the covariances leave out."""
-    free: ClassVar[float] = 1e3
+    free: float = 1e3
     """m; standard deviation of a rigid motion of which nothing is known."""
-    steps: ClassVar[int] = 3
+    steps: int = 3
     """Gauss-Newton steps to the best motion, from the best one without covariances."""
-    exact: ClassVar[float] = 1e-9
+    exact: float = 1e-9
     """m^2 and m; least variance of a place, and least extent of places."""
 
 

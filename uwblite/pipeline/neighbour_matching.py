@@ -3,8 +3,7 @@
 Neighbours make sub-maps stiff, show the offset of the lidar's clock, and tell slips of the wheels.
 """
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,19 +24,18 @@ from .lidar_stages import refine
 from .recordings import denser, later, with_longer_scans
 
 
-@dataclass(frozen=True, slots=True)
 class NeighbourPolicy:
     """Times and weights of the matching of neighbours."""
 
-    likely: ClassVar[float] = 0.5
+    likely: float = 0.5
     """Probability from which on a step slipped."""
-    cuts: ClassVar[int] = 4
+    cuts: int = 4
     """Keyframes added within a doubtful step, at most."""
-    retimings: ClassVar[int] = 5
+    retimings: int = 5
     """Most times that clouds are made again; a quarter of the error remains each time."""
-    least_slope: ClassVar[float] = 0.5
+    least_slope: float = 0.5
     """Least change of the duration that clouds of a scan show as missing per change of the one that they are made with."""
-    inflation: ClassVar[float] = 10.0
+    inflation: float = 10.0
     """Factor on the ranges' standard deviations."""
 
 

@@ -4,8 +4,7 @@ Each recording is bootstrapped on its own, then the recordings are joined. Once 
 the ranges are re-estimated: their noise and the priors of their systematic errors.
 """
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 
@@ -35,14 +34,13 @@ from .progress import solver_figures
 from .recordings import Recording
 
 
-@dataclass(frozen=True, slots=True)
 class LapPolicy:
     """How ranges and path are estimated in turn."""
 
-    laps: ClassVar[int] = 4
+    laps: int = 4
     """Laps of the first optimisation: each estimates noise and optimises the graph; in the last one the radio's calibration is
     free too."""
-    most_growth: ClassVar[float] = 1.3
+    most_growth: float = 1.3
     """Factor by which a typical anchor's scatter grows at most with weaker ranges, where the lidar constrains the poses."""
 
 

@@ -13,8 +13,7 @@ ranges have bent a straight trajectory to suit the place that was found; so alon
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import numpy as np
 
@@ -31,33 +30,32 @@ from .estimate import Estimate, OtherHeights, Task
 from .mapping_config import MappingConfig
 
 
-@dataclass(frozen=True, slots=True)
 class RangePolicy:
     """When another explanation is worth proposing, and when it matters."""
 
-    elsewhere: ClassVar[float] = 0.4
+    elsewhere: float = 0.4
     """m rms between two trajectories from which on it matters which of them is true."""
-    wrong_noise: ClassVar[float] = 10.0
+    wrong_noise: float = 10.0
     """Logarithm of odds between heights that wrong assumptions about the noise of ranges can cause."""
-    noticeable: ClassVar[float] = 1.0
+    noticeable: float = 1.0
     """m above the tag from which on anchors can look like another unit; lower ones lengthen short ranges only."""
-    high: ClassVar[float] = 6.0
+    high: float = 6.0
     """m above the tag; anchors in a large hall."""
-    across: ClassVar[float] = 1.0
-    share: ClassVar[float] = 0.2
+    across: float = 1.0
+    share: float = 0.2
     """Standard deviation of the anchors across their line, m and as a share of that along it, up to which they stand on one."""
-    all_but_one: ClassVar[int] = 5
+    all_but_one: int = 5
     """Number of anchors from which on one of them may be off the line of the others."""
-    near: ClassVar[float] = 0.7
+    near: float = 0.7
     """m from the line up to which a trajectory may have changed sides."""
-    ends: ClassVar[int] = 3
+    ends: int = 3
     """Poses at either end of a trajectory within which no change of sides is tried."""
-    pace: ClassVar[float] = 0.01
+    pace: float = 0.01
     """Share of the evidence that refutes by which a step has to make other places likelier: at a lower pace none of them
     becomes likely in a hundred steps."""
-    straight: ClassVar[float] = 1.0
+    straight: float = 1.0
     """m across a path, rms, beyond which no odometry lets it bend into its mirror image."""
-    bends: ClassVar[float] = 0.05
+    bends: float = 0.05
     """m, the noise of ranges; a path that a lidar holds to less suits no place beside those that given poses allow."""
 
 

@@ -7,7 +7,6 @@ slow robot that is about every fifth scan.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import ClassVar
 
 import numpy as np
 
@@ -25,17 +24,16 @@ from ..sensor_log import SensorLog
 from .mapping_config import MappingConfig
 
 
-@dataclass(frozen=True, slots=True)
 class RecordingPolicy:
     """How recordings are told apart, and which scans a map needs."""
 
-    apart: ClassVar[float] = 1000.0
+    apart: float = 1000.0
     """m of travel assumed between the end of a recording and the start of the next: they are different visits."""
-    sparse: ClassVar[float] = 0.11
+    sparse: float = 0.11
     """s between samples of an odometry slower than 10 Hz, which interpolation does not bridge well."""
-    same_moment: ClassVar[float] = 1e-6
+    same_moment: float = 1e-6
     """s; difference of stamps that is rounding."""
-    scans_per_move: ClassVar[int] = 2
+    scans_per_move: int = 2
     """Scans kept within the distance after which the grid traces the next one: odometry does not know that distance exactly."""
 
 

@@ -13,7 +13,6 @@ it is seen.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -56,25 +55,24 @@ from .keyframe_data import rays_of
 from .lidar_stages import STILL
 
 
-@dataclass(frozen=True, slots=True)
 class SurfacePolicy:
     """Adjustment of poses and surfaces."""
 
-    ahead: ClassVar[float] = 2.0
+    ahead: float = 2.0
     """Farthest that a lidar is from its keyframe, m: its mounting, and the way to the scan."""
-    steps: ClassVar[int] = 6
+    steps: int = 6
     """Most Gauss-Newton steps."""
-    settling: ClassVar[int] = 2
+    settling: int = 2
     """Steps, after the first, before which pairs are measured again; noise is learnt before every step but the first."""
-    still: ClassVar[float] = STILL
+    still: float = STILL
     """The next change of the poses, rms, m, that ends them once noise and pairs have settled."""
-    kernel: ClassVar[float] = OUTLIER
-    wider: ClassVar[float] = 4.0
+    kernel: float = OUTLIER
+    wider: float = 4.0
     """Width of the Geman-McClure kernel on the residual of a ray, standard deviations, and by how much it is wider in the first
     step; half as much in each that follows (graduated non-convexity: A. Blake, A. Zisserman, Visual reconstruction, 1987)."""
-    least: ClassVar[float] = 0.03
+    least: float = 0.03
     """Least weight of a point in pairs of clouds."""
-    prior: ClassVar[tuple[float, ...]] = (1e3, 1e3, 0.0156, 0.1)
+    prior: tuple[float, ...] = (1e3, 1e3, 0.0156, 0.1)
     """Prior standard deviations of a surface: turn and place, rad and m, range offset, m (a device's 10 mm by data sheets, a
     surface's 12 mm by colour and material: L. Kneip et al., ICRA 2009), and radius, m. Those of turn and place must not even
     constrain the heading of the whole map."""
