@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.laser_walks import chained
+from helpers.told import told
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -145,6 +146,20 @@ def test_an_anchor_moved_since_the_earlier_map_is_named_and_does_not_bend_the_ma
     np.testing.assert_allclose(done.graph.anchors, anchors, atol=1e-6)
     solved, _ = optimize(done.graph)
     np.testing.assert_allclose(solved.anchors, anchors, atol=1e-6)
+
+
+def test_it_is_told_with_how_far_it_was_moved():
+    anchors = TRUE.copy()
+    anchors[2] += (2.0, -1.5)
+    graph, stages = first_estimate(anchors=anchors), Stages(None, None)
+    found = BootstrapResult(graph, ALL, (), ~ALL)
+    estimate = Estimate(replace(graph, edges=()), chained(graph.poses, np.full(3, 0.01)), graph.edges[1], IDS, found)
+    given = Constraints(anchors=surveyed(*IDS, movable=True))
+    done = apply_given(estimate, Task(SimpleNamespace(clock=CLOCK), MappingConfig(), given, stages))
+    np.testing.assert_allclose(done.graph.anchors, anchors, atol=0.02)
+    (finding,) = told(stages.facts)
+    assert (finding.kind, finding.severity, finding.anchor) == ("moved-anchor", "warning", "C")
+    assert "anchor C stands 2.50 m from its earlier place" in finding.text
 
 
 def test_a_given_distance_between_anchors_counts():

@@ -23,6 +23,14 @@ def from_scans(first, scans, config=DEFAULT, *, last=None, **options):
     return from_sweeps([Sweeps(scans, first, last)], config, **options)
 
 
+def with_blind_scans(poses, scans, far):
+    """Return poses and scans with two more, so far from the origin, m, that have no reading."""
+    corners = np.array([[-far, -far, 0.0], [far, far, 0.0]])
+    blind = np.full((2, scans.ranges.shape[1]), np.nan, np.float32)
+    stamps = np.append(scans.stamps, scans.stamps[-1] + np.array([1.0, 2.0]))
+    return np.concatenate([poses, corners]), replace(scans, stamps=stamps, ranges=np.concatenate([scans.ranges, blind]))
+
+
 def scan_rays(scans, reach, first, last=None, *, flipped=False):
     return Sweeps(scans, first, last, flipped).rays(np.arange(len(first)), reach)
 
@@ -339,12 +347,10 @@ def test_the_grid_ends_where_knowledge_ends():
     assert (rows[0], cols[0]) == (2, 2)
     assert (len(known) - rows[-1], known.shape[1] - cols[-1]) == (3, 3)
     # The frame is where it was: cells of a larger grid have the same values.
-    wide = GridGeometry(0.05, np.array([-6.0, -6.0]), 240, 240)
-    whole = from_scans(poses, scans, last=np.add(poses, [0.0, 0.0, 0.5]), geometry=wide)
-    row, col = wide.cell_of(grid.geometry.centre_of(np.array(0), np.array(0)))
-    part = whole.log_odds[int(row) :, int(col) :][: known.shape[0], : known.shape[1]]
-    np.testing.assert_array_equal(part, grid.log_odds)
-    np.testing.assert_array_equal(np.count_nonzero(part), np.count_nonzero(whole.log_odds))
+    both = with_blind_scans(poses, scans, 5.9)
+    whole = from_scans(both[0], both[1], last=np.add(both[0], [0.0, 0.0, 0.5]))
+    np.testing.assert_array_equal(whole.log_odds, grid.log_odds)
+    np.testing.assert_allclose(whole.geometry.origin, grid.geometry.origin, atol=1e-12)
 
 
 def test_a_flipped_laser_sees_the_mirror_image():
@@ -404,11 +410,10 @@ def test_the_grid_holds_the_farthest_scans_in_whatever_block_they_stand(backward
     scans = LaserScans(0.1 * np.arange(150), np.full((150, 8), 1.01, np.float32), -math.pi, math.pi / 4, 0.0, 0.02, 5.0)
     grid = from_scans(poses, scans, GridConfig(move_distance=0.0))
     rays = scan_rays(scans, scans.ranges, poses)
-    wide = GridGeometry.around(np.full(2, -25.0), np.full(2, 25.0), 0.05, 10**7)
-    whole = from_scans(poses, scans, GridConfig(move_distance=0.0), geometry=wide)
+    whole = from_scans(*with_blind_scans(poses, scans, 25.0), GridConfig(move_distance=0.0))
     row, col = grid.geometry.cell_of(rays.endpoints)
     assert grid.geometry.inside(row, col).all()
-    np.testing.assert_array_equal(grid.log_odds[row, col], whole.log_odds[wide.cell_of(rays.endpoints)])
+    np.testing.assert_array_equal(grid.log_odds[row, col], whole.log_odds[whole.geometry.cell_of(rays.endpoints)])
     assert np.count_nonzero(grid.log_odds) == np.count_nonzero(whole.log_odds)
 
 

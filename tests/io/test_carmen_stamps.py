@@ -127,6 +127,17 @@ def test_a_stamp_of_zero_among_others_was_never_set(tmp_path):
     np.testing.assert_allclose(log.odometry.poses[:, 0], 0.1 * np.arange(50))
 
 
+@pytest.mark.parametrize(("period", "most"), [(0.125, 11), (1.0 / 64.0, 33), (1.0, 9)])
+def test_a_clock_that_begins_at_zero_has_stamps_of_zero_for_ten_readings_or_half_a_second(period, most):
+    """Later ones were never set, nor are those before a stamp of more than 10 s."""
+    for k in range(1, 60):
+        stamps = period * np.arange(60.0)
+        stamps[k] = 0.0
+        np.testing.assert_array_equal(false_stamps(stamps), (np.arange(60) == k) & (k > most))
+    assert not false_stamps(np.zeros(60)).any()
+    assert not false_stamps(np.append(np.zeros(59), 100.0)).any()
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_false_stamps_are_those_that_were_made_false(seed):
     """Whatever the rhythm; where the lines were mixed or a clock was set back, nothing is called false."""

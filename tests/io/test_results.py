@@ -1,9 +1,11 @@
 """The result's folder: complete, repeatable, replaced as a whole or not at all."""
 
+import base64
 import csv
 import io
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -16,7 +18,9 @@ import pytest
 from helpers.results import EVIL, FILES, contents, small_log, small_result
 
 from uwblite.errors import ConfigError
+from uwblite.grid.occupancy_grid import OCCUPIED
 from uwblite.io import folders, results
+from uwblite.io.png import decode_png
 from uwblite.io.result_text import RunRecord, anchors_csv, covariance_csv
 from uwblite.io.results import check_target, write_result
 from uwblite.io.stored_result import is_of_result, repair_result
@@ -38,6 +42,27 @@ def test_all_files_of_the_contract_are_written(tmp_path):
     assert set(names) == set(contents(tmp_path / "a" / "map")) == FILES
     assert names[0] == "map.png"
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["map"]
+
+
+def test_the_page_shows_the_picture_of_the_grid_a_pixel_a_cell(tmp_path):
+    result = small_result()
+    write_result(tmp_path / "map", [small_log()], result, RECORD)
+    page = (tmp_path / "map" / "report.html").read_text()
+    (shown,) = re.findall(r'<image class="grid"[^>]* href="data:image/png;base64,([^"]*)"', page)
+    pixels = decode_png(base64.b64decode(shown))
+    assert pixels.shape[:2] == result.grid.log_odds.shape
+    dark = pixels.reshape(*pixels.shape[:2], -1)[..., 0] < 100
+    np.testing.assert_array_equal(dark[::-1], result.grid.states() == OCCUPIED)
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path, monkeypatch):
+    """That which exists already, of those in which the result would lie."""
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
+    with pytest.raises(PermissionError) as caught:
+        check_target(tmp_path / "a" / "map", force=False)
+    assert caught.value.filename == str(tmp_path)
+    (tmp_path / "a").mkdir()
+    check_target(tmp_path / "a" / "map", force=False)
 
 
 def test_same_result_same_bytes(tmp_path):

@@ -86,6 +86,19 @@ def test_where_the_gyro_is_silent_the_wheels_turn():
     assert "silent" in told(remarks)[0].text
 
 
+def test_a_gyro_that_turns_otherwise_than_the_wheels_is_not_used():
+    """It is that of another robot, or broken; and one of which nothing shows what it measures is used as it is stated."""
+    stamps, truth = planted.wander(np.random.default_rng(3), 60.0)
+    others = Gyro(stamps, np.sin(0.7 * stamps))
+    log = SensorLog(planted.odometry(stamps, truth), gyro=others)
+    same, facts = heading_from_gyro(log)
+    assert same is log
+    assert "turn otherwise" in told(facts)[0].text
+    assert reading_of(others, planted.odometry(stamps, truth))[0] == 0.0
+    straight = Odometry(stamps, np.column_stack([0.5 * stamps, np.zeros((len(stamps), 2))]))
+    assert reading_of(others, straight) == (1.0, "")
+
+
 def test_a_log_keeps_the_gyro(tmp_path):
     rng = np.random.default_rng(4)
     stamps, truth = planted.wander(rng, 5.0)

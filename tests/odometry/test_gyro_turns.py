@@ -74,6 +74,21 @@ def test_without_a_gyro_poses_are_what_they_were():
     np.testing.assert_array_equal(turns.turned(0.0, wheels[0]), wheels[0])
 
 
+def test_a_single_reading_turns_nothing():
+    stamps, _, wheels = drive(seconds=20.0)
+    turns = GyroTurns()
+    turns.add(stamps[0], 1.0)
+    found = [turns.turned(t, pose) for t, pose in zip(stamps, wheels, strict=True)]
+    np.testing.assert_allclose(found, wheels, atol=1e-9)
+
+
+def test_readings_of_two_minutes_are_kept_where_no_wheels_come():
+    turns = GyroTurns()
+    for stamp in np.arange(0.0, 600.0, 0.5):
+        turns.add(stamp, 0.1 * stamp)
+        assert len(turns._stamps) == len(turns._headings) <= 242
+
+
 def test_the_stated_odometry_remains_that_of_the_wheels():
     """Whoever ties the map to the odometry's frame knows the wheels' poses only."""
     localizer = Localizer(known(ODD, ANCHORS))

@@ -71,7 +71,7 @@ def judged(true, used):
     graph = Graph(truth, calibration=CALIBRATION, fixed_calibration=free).updated(truth, np.zeros((0, 2)), values)
     task = task_of(recordings_of(truth))
     stages = task.stages
-    guarded = with_constant_turn_scales(Estimate(graph, wheels, None, (), steps=steps), task).graph
+    guarded = with_constant_turn_scales(Estimate(graph, wheels, None, ()), steps, task).graph
     return guarded.calibration.values[INDEX], bool(guarded.fixed_calibration[INDEX]), stages
 
 
@@ -97,7 +97,7 @@ def test_a_scale_that_single_turns_made_is_replaced(used):
     assert 0.0 < figures["sigma"] < 0.02
 
 
-def slipping(slip, mounted, given=True):
+def slipping(slip, mounted, given=True, noise=0.003):
     """Return an estimate before and after, and true poses, of wheels that turn about (-slip, 0) under a lidar mounted so far
     ahead of its place; the true poses are as the wheels count but for the slip."""
     rng = np.random.default_rng(5)
@@ -110,8 +110,8 @@ def slipping(slip, mounted, given=True):
     wheels = replace(chained(truth, (0.005, 0.005, 0.005)), motion=motion + 0.005 * rng.standard_normal((STEPS, 3)))
     object.__setattr__(wheels, "calibration", odometry_indices(CALIBRATION, STEPS))
     i, none = np.arange(STEPS), np.zeros((STEPS, 3))
-    seen = se2.between(lidar[:-1], lidar[1:]) + 0.003 * rng.standard_normal((STEPS, 3))
-    steps = ScanEdges(i, i + 1, seen, np.tile(np.eye(3) / 0.003, (STEPS, 1, 1)), none, none, indices(CALIBRATION, *LASER))
+    seen = se2.between(lidar[:-1], lidar[1:]) + noise * rng.standard_normal((STEPS, 3))
+    steps = ScanEdges(i, i + 1, seen, np.tile(np.eye(3) / noise, (STEPS, 1, 1)), none, none, indices(CALIBRATION, *LASER))
     graph = Graph(truth, edges=(prior_edges(listed),), calibration=CALIBRATION)
     graph = with_free(replace(graph, fixed_calibration=np.ones(len(listed), dtype=bool)), "laser_x", "laser_y")
     estimate = Estimate(graph, wheels, None, (), steps=steps)
@@ -152,6 +152,15 @@ def test_what_slip_and_mounting_explain_alike_is_shared_by_their_odds_and_stated
 def test_a_robot_that_turns_about_its_origin_or_has_none_keeps_its_estimate(slip, given):
     before, after, _ = slipping(slip, 0.0, given)
     assert after is before
+
+
+def test_an_offset_that_may_be_noise_says_nothing_of_slip():
+    """Of two that are as large as the noise of the same steps allows and does not allow."""
+    before, after, _ = slipping(0.0, 0.03, noise=0.05)
+    assert abs(before.graph.calibration.get("laser_x")) > 0.01
+    assert after is before
+    before, after, _ = slipping(0.0, 0.15, noise=0.05)
+    assert after is not before
 
 
 @pytest.mark.parametrize("crooked", [0.02, -0.02])

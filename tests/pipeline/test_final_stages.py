@@ -7,6 +7,7 @@ import pytest
 from helpers.planted_graphs import plain_ranges
 from helpers.planted_tasks import estimate_of, recordings_of, task_of
 from helpers.room_recording import recording, two_rounds
+from helpers.told import told
 
 from uwblite import se2
 from uwblite.graph.calibration import CalibrationConfig, block, unknowns
@@ -19,6 +20,7 @@ from uwblite.pipeline import final_stages
 from uwblite.pipeline.final_stages import _sweeps
 from uwblite.pipeline.recordings import gather
 from uwblite.problem.solution import at_given_poses
+from uwblite.radio.range_noise import RangeNoiseConfig
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +90,38 @@ def test_of_anchors_alone_heights_that_the_search_puts_back_to_0_stay_fixed():
     assert found.calibration.values[2] == pytest.approx(4.0, abs=0.5)
     np.testing.assert_allclose(found.anchors[1], anchors[1], atol=0.1)
     np.testing.assert_array_equal(found.poses, poses)
+
+
+def circled(anchors, **fixed):
+    """Return an estimate of a robot that drives round anchors whose places are off by decimetres, and its task."""
+    turn = np.linspace(0.0, 6.0, 80)
+    poses = np.column_stack([4.0 * np.cos(turn), 3.0 * np.sin(turn), turn])
+    pose, anchor = np.repeat(np.arange(80), len(anchors)), np.tile(np.arange(len(anchors)), 80)
+    measured = np.hypot(*(poses[pose, :2] - anchors[anchor]).T)
+    ranges = replace(plain_ranges(pose, anchor, measured, 0.05), stamps=pose.astype(float))
+    before = estimate_of(Graph(poses, anchors + [0.3, -0.2], **fixed), ranges=ranges)
+    return replace(before, graph=before.problem), recordings_of(poses)
+
+
+@pytest.mark.parametrize(("steady", "free", "moved"), [(0.06, True, True), (0.0, True, False), (0.06, False, False)])
+def test_anchors_are_estimated_alone_where_ranges_from_one_direction_err_alike_and_one_is_free(steady, free, moved):
+    anchors = np.array([[7.0, 1.0], [-2.0, 6.0]])
+    before, recordings = circled(anchors, fixed_anchors=np.full(2, not free))
+    config = replace(MappingConfig(), ranges=RangeNoiseConfig(steady=steady))
+    done = final_stages._anchors_alone(before, task_of(recordings, config)).graph.anchors
+    np.testing.assert_allclose(done, anchors if moved else anchors + [0.3, -0.2], atol=0.02)
+
+
+def test_scans_far_from_all_others_are_told_and_left_out():
+    """A pose that a false measurement has thrown kilometres away."""
+    recordings = gather([recording(two_rounds())], KeyframeConfig())
+    poses, task = recordings.each[0].frames.odometry.copy(), task_of(recordings)
+    poses[-1, :2] += 1e5
+    grid = final_stages.occupancy_grid(estimate_of(Graph(poses)), task)
+    (finding,) = told(task.stages.facts)
+    assert (finding.kind, finding.severity) == ("scans-astray", "doubt")
+    assert finding.figures == {"scans": grid.scans_astray, "used": grid.scans_used}
+    assert 0 < grid.scans_astray < grid.scans_used
 
 
 def test_the_time_from_keyframes_to_scans_is_that_of_a_random_walk(room):

@@ -265,3 +265,19 @@ def test_places_have_the_joint_covariance_of_the_graph_and_open_ones_some_metres
     np.testing.assert_allclose(places.covariance[:2, :2], full[:2, :2], rtol=1e-3)
     np.testing.assert_allclose(np.diag(places.covariance)[4:], 25.0, rtol=0.05)
     assert places_of(replace(estimate, bootstrap=None)).names == ()
+
+
+@pytest.mark.parametrize(("ambiguous", "used"), [([], "ABC"), ("A", "BC"), ("AB", "ABC"), ("ABC", "ABC")])
+def test_anchors_that_may_be_mirrored_join_where_fewer_than_two_others_are_placed(ambiguous, used):
+    """One that has no place at all joins never."""
+    rng = np.random.default_rng(0)
+    poses, anchors = random_poses(rng, 60, 6.0), np.array([[8.0, 1.0], [-7.0, 2.0], [3.0, 3.0], [1.0, 1.0]])
+    anchor = np.arange(60) % 3
+    ranges = plain_ranges(np.arange(60), anchor, np.hypot(*(poses[:, :2] - anchors[anchor]).T), 0.1)
+    graph = Graph(poses, anchors, fixed_poses=np.ones(60, dtype=bool))
+    placed, unclear = np.arange(4) < 3, np.array([name in ambiguous for name in "ABCD"])
+    found = BootstrapResult(graph, placed, ((),) * 4, unclear)
+    estimate = estimate_of(graph, ranges=ranges, anchor_ids="ABCD", bootstrap=found)
+    places = places_of(estimate)
+    assert places.names == tuple(used)
+    np.testing.assert_array_equal(places.at, anchors[["ABCD".index(name) for name in used]])

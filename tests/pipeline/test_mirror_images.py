@@ -216,3 +216,25 @@ def test_a_path_and_its_anchors_have_a_mirror_image_together_unless_the_path_ben
     assert (image is not None) is ambiguous
     if image is not None:
         np.testing.assert_array_less(image.anchors[:, 1], 0.0)
+
+
+@pytest.mark.parametrize(("turns", "ambiguous"), [(0.1, [True, True, True]), (0.005, [True, True, False])])
+def test_an_anchor_beside_a_curve_has_a_mirror_image_with_all_others_where_no_turn_is_known(turns, ambiguous):
+    """Two anchors are in reach of the straight part alone. A lidar would show which way the robot turns."""
+    x = np.linspace(0.0, 20.0, 90)
+    tags = np.column_stack([x, 0.05 * np.maximum(x - 8.0, 0.0) ** 2])
+    heading = np.append(np.arctan2(*np.diff(tags, axis=0).T[::-1]), 0.0)
+    poses, anchors = np.column_stack([tags, heading]), np.array([[2.0, 3.0], [5.0, -4.0], [11.0, 5.0]])
+    wheels = relative_edges(poses, np.arange(89), np.arange(1, 90), (0.01, 0.01, turns))
+    pose, anchor = np.concatenate([np.tile(np.arange(30), 2), np.arange(90)]), np.repeat([0, 1, 2], [30, 30, 90])
+    noise = np.random.default_rng(2).normal(0.0, 0.1, len(pose))
+    measured = plain_ranges(pose, anchor, np.hypot(*(tags[pose] - anchors[anchor]).T) + noise, 0.1)
+    graph = optimize(Graph(poses, anchors, (wheels, measured), fixed_poses=np.arange(90) == 0), SolverConfig())[0]
+    known, found = np.ones(3, dtype=bool), tuple((place(each),) for each in graph.anchors)
+    before = estimated(graph, measured, known, ~known, found)
+    done = find_mirror_images(before, WITHOUT_LIDAR).bootstrap
+    assert done.ambiguous.tolist() == ambiguous
+    images = [each[-1].position for each in done.hypotheses]
+    for image, its, anchor in zip(images, ambiguous, graph.anchors, strict=True):
+        assert np.hypot(*(image - anchor * (1.0, -1.0 if its else 1.0))) < 1.5  # the path turns about its middle
+    assert find_mirror_images(before, TASK).bootstrap.ambiguous.tolist() == [True, True, False]

@@ -26,6 +26,8 @@ _HIT = 128
 _MOST_SCANS = _HIT - 1
 _SPARSE = 0.1
 """Share of the cells of a window up to which they are added one by one, in as much time for each as ten in a row take."""
+_MARGIN = 2
+"""Cells around all that rays met."""
 _LONGEST_RAY = 1 << 14
 """Cells; a longer ray would need a window of more than 256 MB."""
 _MANY = np.iinfo(np.uint16).max
@@ -151,7 +153,7 @@ class RayCounter:
         """Return which cells of some rows a ray met."""
         return (self.hits[rows] > 0) | (self.misses[rows] > 0)
 
-    def cropped(self, margin: int = 2) -> "RayCounter":
+    def cropped(self) -> "RayCounter":
         """Return the same counts in the smallest grid that holds all of them and a margin of cells."""
         in_rows, in_cols = (np.zeros(size, dtype=np.bool_) for size in self.hits.shape)
         for some in self.geometry.strips():
@@ -161,8 +163,8 @@ class RayCounter:
         rows, cols = np.flatnonzero(in_rows), np.flatnonzero(in_cols)
         if len(rows) == 0:
             return self
-        top, left = max(int(rows[0]) - margin, 0), max(int(cols[0]) - margin, 0)
-        window = slice(top, int(rows[-1]) + margin + 1), slice(left, int(cols[-1]) + margin + 1)
+        top, left = max(int(rows[0]) - _MARGIN, 0), max(int(cols[0]) - _MARGIN, 0)
+        window = slice(top, int(rows[-1]) + _MARGIN + 1), slice(left, int(cols[-1]) + _MARGIN + 1)
         counter = copy(self)
         counter.hits, counter.misses = self.hits[window], self.misses[window]
         counter.geometry = self.geometry.window(top, left, *counter.hits.shape)

@@ -97,7 +97,6 @@ def from_sweeps(
     recordings: Sequence[Sweeps],
     config: GridConfig,
     *,
-    geometry: GridGeometry | None = None,
     progress: Progress | None = None,
     announce: Callable[[GridGeometry], object] | None = None,
 ) -> OccupancyGrid:
@@ -105,8 +104,7 @@ def from_sweeps(
 
     Parameters
     ----------
-    geometry : the grid to fill; None = the smallest around all rays, coarser where config.max_cells asks for it.
-    announce : called with the geometry before the grid is allocated.
+    announce : called with the grid's geometry, the smallest around all rays, before it is allocated.
 
     Raises
     ------
@@ -118,16 +116,16 @@ def from_sweeps(
         raise DataError("there are no scans to make a map of")
     chosen = sum(len(task.chosen) for task in tasks)
     low, high = _extent(tasks)
-    if geometry is None and np.prod((high - low) / config.resolution) > config.max_cells:
+    if np.prod((high - low) / config.resolution) > config.max_cells:
         # Scans that lie far from all others are left out.
         box = central_box(np.concatenate([task.places for task in tasks]))
         tasks = [task for task in (task.within(*box) for task in tasks) if len(task.chosen)]
         low, high = _extent(tasks)
     count = sum(len(task.chosen) for task in tasks)
-    grid = geometry or GridGeometry.around(low, high, config.resolution, config.max_cells)
+    geometry = GridGeometry.around(low, high, config.resolution, config.max_cells)
     if announce is not None:
-        announce(grid)
-    counter = RayCounter(grid, config.clear_weight, most=count)
+        announce(geometry)
+    counter = RayCounter(geometry, config.clear_weight, most=count)
     clears = config.max_clear_distance > 0 and config.clear_weight > 0
 
     def trace(counter: RayCounter, walls: Bools | None, before: int) -> None:
@@ -142,7 +140,7 @@ def from_sweeps(
     trace(counter, None, 0)
     if clears:
         trace(counter, walls_of(counter, config), count)
-    drawn = from_counts(counter if geometry else counter.cropped(), config)
+    drawn = from_counts(counter.cropped(), config)
     del counter  # Its hits take half as much memory as the map.
     missing = missing_share(recordings, drawn, config.max_clear_distance) if clears else math.nan
     return replace(drawn, scans_used=count, scans_astray=chosen - count, missing_share=missing)

@@ -170,11 +170,10 @@ def false_stamps(stamps: Floats) -> Bools:
     """
     false = np.zeros(len(stamps), dtype=bool)
     zero = stamps == 0.0
-    if zero.any() and not zero.all():
-        set_ones = np.flatnonzero(~zero)
+    set_ones = np.flatnonzero(~zero)
+    if zero.any() and len(set_ones) > 1:
         before, after = _neighbours(np.arange(len(stamps)), set_ones, stamps[set_ones])
-        steps = np.abs(np.diff(stamps[set_ones]))
-        late = max(CONFIRMED, _PERIODS * float(np.median(steps))) if len(steps) else _FAR
+        late = max(CONFIRMED, _PERIODS * float(np.median(np.abs(np.diff(stamps[set_ones])))))
         false = zero & ((before > late) | (np.isfinite(after) & (after > _FAR)))
     rest = np.flatnonzero(~false)
     if np.any(np.diff(stamps[rest]) < -_FAR):

@@ -14,6 +14,7 @@ from ..arrays import ENOUGH, TINY, Bools, Floats
 from ..errors import SolverError
 from ..graph.calibration import TURNING, with_free
 from ..graph.marginals import marginals
+from ..graph.pose_edges import ScanEdges
 from ..graph.solver import Optimizer, optimize
 from ..lidar.joint_refinement import RefinementConfig
 from ..lidar.scan_duration import PARTS, MovedRays, missing_duration
@@ -48,20 +49,16 @@ class TurningPolicy:
     """Prior odds of a robot that slips in turns against one that does not."""
 
 
-def with_constant_turn_scales(estimate: Estimate, task: Task) -> Estimate:
+def with_constant_turn_scales(estimate: Estimate, steps: ScanEdges, task: Task) -> Estimate:
     """Fix each scale of turns at the lidar's from step to step, where the scale of the whole estimate contradicts it.
 
     A turn that the wheels missed, or a heading lost in a fast turn, then stays a local error. Where the scale of the steps is
     the larger correction, the estimate keeps its own, and the map is checked at the end: the lidar may be wrong.
     """
     graph = estimate.graph
-    if estimate.steps is None:
-        return estimate
     values, fixed = graph.calibration.values.copy(), graph.fixed_calibration.copy()
-    for index, found in turn_scales(estimate.odometry, estimate.steps, graph).items():
-        if fixed[index]:
-            values[index] = found.value
-        elif found.contradicts(used := float(values[index])) and abs(found.value) < abs(used):
+    for index, found in turn_scales(estimate.odometry, steps, graph).items():
+        if found.contradicts(used := float(values[index])) and abs(found.value) < abs(used):
             label = graph.calibration.keys[index].label
             task.stages.note("turn-scale", name=label, by_steps=found.value, sigma=found.sigma, by_all=used)
             values[index], fixed[index] = found.value, True

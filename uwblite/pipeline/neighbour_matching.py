@@ -229,7 +229,7 @@ def _match_neighbours(estimate: Estimate, track: ScanOdometry, task: Task) -> Es
         slipped=int(np.sum(track.slips > NeighbourPolicy.likely)),
     )
     estimate = replace(estimate, graph=graph.with_estimates_of(refined.graph), steps=refined.edges)
-    return calibration_checks.with_constant_turn_scales(estimate, task)
+    return calibration_checks.with_constant_turn_scales(estimate, refined.edges, task)
 
 
 def _with_inflated_ranges(estimate: Estimate) -> Estimate:
