@@ -13,7 +13,7 @@ import pytest
 from helpers.example_settings import Outer
 
 import uwblite
-from uwblite.config import documented, field_docs, from_dict, leaves, merge, override, parse_toml, setting, to_dict
+from uwblite.config import documented, field_docs, from_dict, leaves, merge, override, parse_toml, setting, to_dict, toml_value
 from uwblite.errors import ConfigError
 from uwblite.graph.graph import Graph
 from uwblite.graph.range_edges import RangeEdges
@@ -64,6 +64,19 @@ def test_wrong_settings_are_named(data, message):
         return
     with pytest.raises(ConfigError, match=re.escape(message)):
         from_dict(Outer, data)
+
+
+@pytest.mark.parametrize("group", ["ranges", "odometry"])
+def test_a_wrong_kernel_is_named_with_where_it_stands(group):
+    with pytest.raises(ConfigError, match=f"{group}.kernel.name must be one of none, .*did you mean 'huber'"):
+        merge(MappingConfig(), {group: {"kernel": {"name": "hubr"}}})
+    with pytest.raises(ConfigError, match=f"{group}.kernel.scale = 0.0 is out of range; it must be > 0"):
+        merge(MappingConfig(), {group: {"kernel": {"scale": 0}}})
+
+
+def test_what_toml_cannot_hold_is_named():
+    with pytest.raises(ConfigError, match="cannot write a complex as TOML"):
+        toml_value({"a": [1, 2j]})
 
 
 def test_a_number_with_a_natural_default_must_not_be_negative():

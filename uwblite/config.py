@@ -123,10 +123,7 @@ def _merge(config: Any, data: Any, path: tuple[str, ...], root: type, *, sized: 
             if sized:
                 _check_size(converted, fields[name].default, where)
             changes[name] = _check_range(converted, _limits(fields[name]), where)
-    try:
-        return dataclasses.replace(config, **changes)
-    except ConfigError as error:
-        raise ConfigError(f"[{'.'.join(path)}] {error}" if path else str(error)) from None
+    return dataclasses.replace(config, **changes)
 
 
 def _unknown(where: tuple[str, ...], cls: type, root: type) -> str:

@@ -65,6 +65,6 @@ def test_kernels_are_checked():
     with pytest.raises(ConfigError, match="hubert"):
         Kernel("hubert")
     for scale in (0.0, -1.0, float("nan")):
-        with pytest.raises(ConfigError, match="positive"):
+        with pytest.raises(ConfigError, match="must be > 0"):
             Kernel("huber", scale)
     assert SQUARED.rho(np.array(7.0)) == 7.0

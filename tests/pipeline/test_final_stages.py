@@ -92,6 +92,9 @@ def test_of_anchors_alone_heights_that_the_search_puts_back_to_0_stay_fixed():
     np.testing.assert_array_equal(found.poses, poses)
 
 
+AWAY = np.array([0.3, -0.2])
+
+
 def circled(anchors, **fixed):
     """Return an estimate of a robot that drives round anchors whose places are off by decimetres, and its task."""
     turn = np.linspace(0.0, 6.0, 80)
@@ -99,7 +102,7 @@ def circled(anchors, **fixed):
     pose, anchor = np.repeat(np.arange(80), len(anchors)), np.tile(np.arange(len(anchors)), 80)
     measured = np.hypot(*(poses[pose, :2] - anchors[anchor]).T)
     ranges = replace(plain_ranges(pose, anchor, measured, 0.05), stamps=pose.astype(float))
-    before = estimate_of(Graph(poses, anchors + [0.3, -0.2], **fixed), ranges=ranges)
+    before = estimate_of(Graph(poses, anchors + AWAY, **fixed), ranges=ranges)
     return replace(before, graph=before.problem), recordings_of(poses)
 
 
@@ -109,7 +112,7 @@ def test_anchors_are_estimated_alone_where_ranges_from_one_direction_err_alike_a
     before, recordings = circled(anchors, fixed_anchors=np.full(2, not free))
     config = replace(MappingConfig(), ranges=RangeNoiseConfig(steady=steady))
     done = final_stages._anchors_alone(before, task_of(recordings, config)).graph.anchors
-    np.testing.assert_allclose(done, anchors if moved else anchors + [0.3, -0.2], atol=0.02)
+    np.testing.assert_allclose(done, anchors if moved else anchors + AWAY, atol=0.02)
 
 
 def test_scans_far_from_all_others_are_told_and_left_out():

@@ -160,3 +160,16 @@ def test_clouds_taken_over_are_those_made_again(steps):
     former = np.concatenate([keyframe_data._former(*pair, SETTINGS, 0.02) for pair in pairs])
     assert 0 < np.sum(former < 0) < len(former) / 2
     np.testing.assert_array_equal(before.stamps[former[former >= 0]], after.stamps[former >= 0])
+
+
+def test_ranges_of_the_second_of_two_recordings_follow_its_keyframes(exact):
+    """The first one has none."""
+    (alone,), estimate = exact[0].each, exact[1]
+    before = gather([alone.log.without(uwb=True), alone.log], MappingConfig().keyframes)
+    count = len(alone.frames)
+    ranges = replace(estimate.ranges, pose=estimate.ranges.pose + count)
+    again = keyframe_data._attached(ranges, before, later(before, 0.06))
+    expected = keyframe_data._attached(estimate.ranges, exact[0], later(exact[0], 0.06))
+    np.testing.assert_array_equal(again.pose, expected.pose + count)
+    for name in ("lever_arm", "turn", "velocity"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(expected, name))

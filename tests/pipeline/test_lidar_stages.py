@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.laser_walks import HALL, walked, with_a_walker
 from helpers.planted import odometry, recording, scans, wander
+from helpers.planted_graphs import plain_ranges
 from helpers.planted_tasks import estimate_of, recordings_of, task_of
 from helpers.told import doubted
 
@@ -19,6 +20,7 @@ from uwblite.pipeline import keyframe_data, lidar_stages, neighbour_matching, ra
 from uwblite.pipeline.lidar_stages import check_map_consistency
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.recordings import gather
+from uwblite.radio.range_noise import RangeNoiseConfig
 
 NO_PAIRS = ScanEdges(
     *(np.zeros(0, dtype=np.intp) for _ in range(2)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3)),
@@ -83,6 +85,16 @@ def test_scans_between_keyframes_show_where_the_robot_was_when_stamps_of_the_odo
     np.testing.assert_array_equal(after.trajectory_stamps, stamps)
     thinner = replace(after, log=replace(log, odometry=log.odometry.rows(slice(None, None, 2))))
     assert np.isin(after.between.frames.stamps, thinner.trajectory_stamps).all()
+
+
+def test_ranges_whose_errors_are_their_own_are_not_corrected_by_direction():
+    graph = Graph(np.zeros((2, 3)), np.array([[3.0, 1.0]]))
+    ranges = plain_ranges(np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp), np.array([3.2]), 0.1)
+    none, some = estimate_of(graph), estimate_of(graph, ranges=ranges)
+    task = task_of(config=replace(MappingConfig(), ranges=RangeNoiseConfig(steady=0.0)))
+    assert lidar_stages._without_pattern(some, task) is some
+    assert lidar_stages._without_pattern(none, task_of()) is none
+    assert lidar_stages._without_pattern(some, task_of()) is not some
 
 
 @pytest.mark.parametrize("torn", [False, True])

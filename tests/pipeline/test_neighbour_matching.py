@@ -4,14 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted import box, odometry, recording, scans, wander
+from helpers.planted import box, odometry, ranges, recording, scans, wander
+from helpers.told import told
 
+from uwblite import se2
 from uwblite.constraints import Constraints
 from uwblite.pipeline import calibration_checks, neighbour_matching
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.radio_stages import dead_reckoning
+from uwblite.pipeline.radio_stages import dead_reckoning, first_optimisation
 from uwblite.pipeline.recordings import gather
 from uwblite.sensor_log import Odometry, OdometryBreaks, Screening, SensorMounting
 
@@ -66,6 +68,11 @@ def test_a_scan_takes_as_long_as_clouds_of_other_headings_show(takes, stated, fl
     np.testing.assert_allclose(scans_now.middles, seen.middles, atol=1e-9)
     assert facts[0]["stated"] == pytest.approx(stated)
     assert facts[0]["duration"] == scans_now.duration
+    (finding,) = told(task.stages.facts)
+    assert (finding.severity, finding.recording) == ("warning", 1)
+    assert f"a scan takes {scans_now.duration:.3f} s" in finding.text
+    assert f"`laser_time_increment` to {scans_now.duration / 239:.6f} s" in finding.text
+    assert f"stamp scans {0.5 * (scans_now.duration - stated):.3f} s earlier" in finding.text
     assert np.mean(steps.share[steps.enough]) > 0.8
 
 
@@ -105,3 +112,39 @@ def test_an_error_that_grows_when_it_is_corrected_is_not_one_of_the_duration(mon
     assert found.recordings.each[0].log.scans.duration == 0.0
     np.testing.assert_array_equal(found.lidar.clouds.points, estimate.lidar.clouds.points)
     assert not task.stages.facts
+
+
+def test_an_offset_that_grows_when_it_is_corrected_is_no_constant_of_the_clock(monkeypatch):
+    rng = np.random.default_rng(4)
+    stamps, truth = wander(rng, 20.0)
+    seen = scans(stamps, truth, box(13, 11), beams=120, sweep=0.0)
+    seen = seen.rows(np.arange(5, len(seen.stamps) - 5))
+    task, estimate, steps = descended(recording(Odometry(stamps, truth), None, seen, mounting=SensorMounting()))
+    shown = iter([0.02, 0.05])
+    monkeypatch.setattr(calibration_checks, "late", lambda *_: next(shown))
+    found, _ = neighbour_matching._with_clock_found(estimate, steps, task)
+    assert found.lidar.delay == 0.0
+    np.testing.assert_allclose(found.recordings.each[0].frames.stamps, task.recordings.each[0].frames.stamps, atol=1e-9)
+    (fact,) = task.stages.facts
+    assert (fact.kind, fact.figures) == ("clock-offset", {"offset": 0.02})
+
+
+def test_a_step_over_which_the_wheels_slip_gets_keyframes_at_the_scans_within_it():
+    """In a recording with ranges, which judge the path; between these scans the wheels still count what does not slip."""
+    rng = np.random.default_rng(3)
+    stamps, truth = wander(rng, 30.0)
+    slip = (stamps[:-1] > 20.0) & (stamps[:-1] < 21.0)
+    motion = se2.between(truth[:-1], truth[1:]) * np.where(slip, 3.0, 1.0)[:, None]
+    places = np.array([[4.0, 3.0], [-4.0, 3.2], [3.8, -3.0], [-4.2, -2.8]])
+    radio = ranges(rng, stamps, truth, places, sigma=0.05)
+    seen = scans(stamps, truth, box(11, 10), rate=10.0, beams=180, sweep=0.0, noise=0.01, rng=rng)
+    log = recording(Odometry(stamps, se2.chain(truth[0], motion)), radio, seen, mounting=SensorMounting(anchor_height=0.0))
+    config = MappingConfig()
+    task = Task(gather([log], config.keyframes), config, Constraints(), Stages(None, None))
+    found = neighbour_matching.match_scan_to_scan(first_optimisation(task), task)
+    added = np.setdiff1d(found.recordings.stamps, task.recordings.stamps)
+    assert 0 < len(added) <= 3 * neighbour_matching.NeighbourPolicy.cuts
+    assert np.all((added > 19.0) & (added < 22.0))
+    true = se2.interpolate_trajectory(stamps, truth, found.recordings.stamps)
+    off = se2.between(se2.between(true[:-1], true[1:]), se2.between(found.graph.poses[:-1], found.graph.poses[1:]))
+    assert np.hypot(*off[:, :2].T).max() < 0.05

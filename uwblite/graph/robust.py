@@ -4,29 +4,31 @@ Properties: rho(s) ~ s for small s, weight(0) = 1, weight is the derivative of r
 """
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
 from ..arrays import Floats
+from ..config import require_permitted, setting
 from ..errors import ConfigError
 
-KERNELS = ("none", "huber", "cauchy", "geman-mcclure")
+KernelName = Literal["none", "huber", "cauchy", "geman-mcclure"]
+KERNELS: tuple[KernelName, ...] = get_args(KernelName)
 
 
 @dataclass(frozen=True, slots=True)
 class Kernel:
     """A robust kernel and its scale."""
 
-    name: str = "none"
-    """none, huber, cauchy or geman-mcclure."""
-    scale: float = 1.0
+    name: KernelName = "none"
+    """Which function of the whitened norm replaces its square; none = the square."""
+    scale: float = setting(1.0, above=0.0)
     """Whitened norm (in standard deviations) at which the kernel departs from the square."""
 
     def __post_init__(self) -> None:
         if self.name not in KERNELS:
             raise ConfigError(f"unknown robust kernel {self.name!r}; choose one of {', '.join(KERNELS)}")
-        if not self.scale > 0:
-            raise ConfigError(f"a robust kernel's scale must be positive, not {self.scale}")
+        require_permitted(self)
 
     def rho(self, s: Floats) -> Floats:
         """Return the robust cost of squared whitened norms s (...)."""
