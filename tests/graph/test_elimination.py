@@ -8,6 +8,7 @@ from uwblite.graph.elimination import (
     EliminationPolicy,
     _pairs_of,
     adjacency,
+    choose_ordering,
     column_sizes,
     count_multiplications,
     elimination_tree,
@@ -127,3 +128,15 @@ def test_subtrees_of_columns_are_contiguous(seed):
             size[above] += size[column]
     # In one piece: the last of a subtree before its root is a child of it.
     assert all(size[c] == 1 or parent[c - 1] == c for c in range(len(parent)))
+
+
+def test_poses_tied_to_any_others_are_left_to_iteration_before_work_is_counted():
+    """Those along a chain alone are a band."""
+    n = 4000
+    chain, width = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1), np.full(n, 3)
+    links = np.random.default_rng(0).integers(0, n, (n, 2))
+    ordering = choose_ordering(np.vstack([chain, links]), n, width)
+    assert (ordering.iterative, ordering.work) == (True, 0.0)
+    np.testing.assert_array_equal(ordering.order, np.arange(n))
+    banded = choose_ordering(chain, n, width)
+    assert (banded.iterative, banded.banded) == (False, True)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.planted_graphs import dense_system, relative_edges
+from scipy import sparse
 
 from uwblite import se2
 from uwblite.errors import SolverError
@@ -171,3 +172,11 @@ def test_iterations_are_counted():
     factor.solve(-np.asarray(normal.gradient))
     assert iterated(factor) == 2.0 * once > 0.0
     assert iterated(None) == 0.0
+
+
+def test_a_piece_that_nothing_measures_is_refused():
+    number = np.arange(180).reshape(60, 3)
+    pieces = cut(number, np.zeros((60, 3)), 180, np.ones(59, dtype=bool))
+    values = np.where(np.arange(180) < 30, 0.0, 1.0)
+    with pytest.raises(SolverError, match="singular"):
+        TwoLevelFactor(sparse.csc_matrix(sparse.diags(values)), pieces)

@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.planted import ranges, wander
+from helpers.planted_graphs import plain_ranges
 
+from uwblite.errors import SolverError
 from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unknowns
-from uwblite.graph.graph import Graph, PriorEdges
+from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.marginals import calibration_covariance
 from uwblite.graph.solver import optimize
 from uwblite.odometry.attached import attach_ranges
@@ -20,6 +22,7 @@ from uwblite.radio.prior_selection import (
     _mean_under,
     _units,
     select_priors,
+    with_alike_heights,
     with_calibrated_radio,
 )
 from uwblite.radio.range_measurements import range_edges
@@ -259,3 +262,21 @@ def test_a_calibrated_radio_has_the_narrowest_priors_tried():
     # A prior that is narrower stays.
     narrow = replace(CONFIG, range_bias_sound=0.5, range_bias=0.5)
     assert widths(with_calibrated_radio(done, narrow)) == pytest.approx(after)
+
+
+def test_heights_are_left_alone_where_the_measurements_leave_a_direction_open(monkeypatch):
+    keys, places = tuple(map(UnknownKey, ["height2"] * 3)), np.array([[3.0, 1.0], [-2.0, 2.0], [1.0, -3.0]])
+    columns = np.full((3, 6), -1)
+    columns[:, 2] = np.arange(3)
+    ranges = replace(plain_ranges(np.zeros(3, dtype=np.intp), np.arange(3), np.full(3, 4.0), 0.1), calibration=columns)
+    heights = PriorEdges("calibration", np.arange(3), np.zeros((3, 1)), np.full((3, 1, 1), 0.1))
+    graph = Graph(np.zeros((1, 3)), places, (heights, ranges), Calibration(keys, np.full(3, 4.0)))
+    graph = replace(graph, fixed_anchors=np.ones(3, dtype=bool))
+    alike = with_alike_heights(graph).edges[0]
+    assert np.all(alike.value > 0.0)
+
+    def open_direction(graph):
+        raise SolverError("singular")
+
+    monkeypatch.setattr(prior_selection, "calibration_covariance", open_direction)
+    assert with_alike_heights(graph) is graph

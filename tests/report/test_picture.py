@@ -1,4 +1,5 @@
 import tracemalloc
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -273,3 +274,18 @@ def test_pictures_side_by_side_are_as_high_as_the_highest():
     np.testing.assert_array_equal(both[:3, :4], low)
     np.testing.assert_array_equal(both[:, 4:], high)
     assert np.all(both[3:, :4] == FLOOR)
+
+
+def test_stretches_that_are_not_to_be_trusted_are_marked_where_they_are():
+    """Along that part of the path alone, and in the legend."""
+    kept = {"anchors": [DrawnAnchor("A", np.array([0.0, 3.0]))]}
+    pictures = [
+        draw_map(DrawnMap(room(), paths, doubted=doubted, **kept))
+        for paths, doubted in (([], []), ([PATH_IN_ROOM], []), ([PATH_IN_ROOM], [PATH_IN_ROOM[10:30, :2]]))
+    ]
+    path, marked = (np.flatnonzero((a != b)[:800].any(axis=(0, 2))) for a, b in pairwise(pictures))
+    per_step = (path[-1] - path[0]) / 49
+    assert marked[0] == pytest.approx(path[0] + 10 * per_step, abs=12)
+    assert marked[-1] == pytest.approx(path[0] + 29 * per_step, abs=12)
+    assert share(pictures[2], rgb("fabe14"), 70) > share(pictures[1], rgb("fabe14"), 70)
+    assert (pictures[1][-STRIP:] != pictures[2][-STRIP:]).any()

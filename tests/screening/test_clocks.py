@@ -12,7 +12,7 @@ from uwblite import se2
 from uwblite.errors import DataError
 from uwblite.screening import clocks
 from uwblite.screening.clocks import with_late_scans_placed
-from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, UwbRanges
+from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, UwbRanges, in_bursts
 
 
 def moving(stamps):
@@ -195,6 +195,14 @@ def test_late_scans_alone_get_the_poses_that_they_show(turning):
     before, late = (done.odometry.poses[np.array(LATE) - back] for back in (1, 0))
     true = se2.between(taken[np.array(LATE) - 1], taken[np.array(LATE)])
     np.testing.assert_allclose(se2.between(before, late), true, atol=0.02)
+
+
+def test_scans_that_all_came_in_time_are_left_alone(turning):
+    log, _ = turning
+    some = np.setdiff1d(np.arange(len(log.scans.stamps)), LATE)
+    sound = replace(log, scans=log.scans.rows(some), odometry=log.odometry.rows(some))
+    assert in_bursts(sound.scans.stamps)
+    assert with_late_scans_placed(sound) == (sound, [])
 
 
 def test_scans_with_times_are_left_alone(turning):
