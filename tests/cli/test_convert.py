@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from uwblite.cli import main
-from uwblite.io.carmen import read_log
+from uwblite.io.carmen import read_log, write_log
 from uwblite.io.formats import read_graph
+from uwblite.io.result_text import RunRecord
+from uwblite.io.results import write_result
 from uwblite.io.tum import read_tum
 
 
@@ -178,3 +180,67 @@ def test_a_map_becomes_a_bundle_for_nav2(tmp_path, capsys):
     assert "is the map itself" in capsys.readouterr().err
     assert main(["convert", str(tmp_path / "map"), str(tmp_path / "map" / "map.pgm"), "--to", "nav2", "--force"]) == 1
     assert "is a file" in capsys.readouterr().err
+
+
+def test_a_map_becomes_a_graph_with_the_scans_of_its_recording_and_a_trajectory(tmp_path, capsys):
+    from helpers.results import small_folder, small_log
+
+    small_folder(tmp_path / "map")
+    write_log(tmp_path / "run.log", small_log())
+    source, target = str(tmp_path / "map"), tmp_path / "graph.g2o"
+    assert main(["convert", source, str(target), "--recording", str(tmp_path / "run.log")]) == 0
+    assert f"{target}: 24 poses, 24 poses with a scan" in capsys.readouterr().out
+    assert target.read_text().count("ROBOTLASER1 ") == 24
+    assert len(read_graph(str(target)).graph.poses) == 24
+    for to, words in (("tum", 8), ("kitti", 12)):
+        assert main(["convert", source, str(tmp_path / "path.txt"), "--to", to, "--force"]) == 0
+        assert f"{tmp_path / 'path.txt'}: 24 poses" in capsys.readouterr().out
+        assert [len(line.split()) for line in (tmp_path / "path.txt").read_text().splitlines()] == [words] * 24
+    assert main(["convert", source, str(tmp_path / "path.log")]) == 1
+    assert "not a format for a map; use --to nav2, mcap" in capsys.readouterr().err
+    assert main(["convert", str(tmp_path / "run.log"), "x.csv", "--recording", "run.log"]) == 1
+    assert "--recording goes with a map" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_a_map_becomes_a_bag_with_or_without_its_recording(tmp_path, capsys, recorded):
+    pytest.importorskip("rosbags.highlevel", reason="rosbags is absent")
+    from helpers.results import small_folder, small_log
+
+    small_folder(tmp_path / "map")
+    write_log(tmp_path / "run.log", small_log())
+    words = ["--recording", str(tmp_path / "run.log")] if recorded else []
+    assert main(["convert", str(tmp_path / "map"), str(tmp_path / "bag"), "--to", "mcap", *words, "--json"]) == 0
+    output = json.loads(capsys.readouterr().out)
+    assert output["counts"] == {"anchors": 2, "closures": 3}
+    assert ("without scans and odometry" in output["note"]) is not recorded
+    assert main(["convert", str(tmp_path / "bag"), "--list"]) == 0
+    assert ("/scan" in capsys.readouterr().out) is recorded
+
+
+def test_of_a_map_of_several_recordings_the_first_trajectory_is_written_and_that_said(tmp_path, capsys):
+    from helpers.results import small_log, small_result
+
+    record = RunRecord("uwblite map run.log again.log", "")
+    write_result(tmp_path / "map", [small_log(), small_log(name="again.log")], small_result(each=2), record)
+    assert main(["convert", str(tmp_path / "map"), str(tmp_path / "path.tum")]) == 0
+    assert "holds 2 trajectories; this is the first of them" in capsys.readouterr().err
+    np.testing.assert_allclose(read_tum(tmp_path / "path.tum")[0], read_tum(tmp_path / "map" / "trajectory.tum")[0])
+
+
+def test_a_trajectory_becomes_the_odometry_of_a_recording(tmp_path, capsys):
+    stamps, turn = np.array([3.0, 1.0, 2.0]), np.array([0.3, 0.1, 0.2])
+    rows = np.column_stack([stamps, stamps, 2.0 * stamps, 0.0 * stamps, 0.0 * stamps, 0.0 * stamps, np.sin(turn), np.cos(turn)])
+    np.savetxt(tmp_path / "path.tum", rows)
+    source = str(tmp_path / "path.tum")
+    assert main(["convert", source, str(tmp_path / "run.log")]) == 0
+    assert "run.log: 3 odometry readings" in capsys.readouterr().out
+    odometry = read_log(tmp_path / "run.log").odometry
+    np.testing.assert_allclose(odometry.poses, np.outer([1.0, 2.0, 3.0], [1.0, 2.0, 0.2]), atol=1e-6)
+    assert main(["convert", source, str(tmp_path / "tables") + "/"]) == 0
+    assert "ranges.csv and scans.csv may be added" in capsys.readouterr().out
+    assert main(["convert", source, str(tmp_path / "poses.kitti"), "--to", "kitti"]) == 0
+    assert main(["convert", str(tmp_path / "poses.kitti"), str(tmp_path / "again.log")]) == 1
+    assert "KITTI poses have no times" in capsys.readouterr().err
+    assert main(["convert", source, str(tmp_path / "graph.g2o")]) == 1
+    assert "not a format for a trajectory" in capsys.readouterr().err
