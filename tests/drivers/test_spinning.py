@@ -98,6 +98,19 @@ def test_a_silence_is_counted_and_the_stamps_hold(name):
     assert max(map(abs, errors)) < 0.003
 
 
+@pytest.mark.parametrize("name", LIDARS)
+def test_a_silence_of_little_more_than_a_turn_is_no_part_of_one(name):
+    """The motor stands as after a tenth of a turn: when it came there the readings do not tell."""
+    _, turns, _ = run(name, 2.5)
+    turn = turns[-1] - turns[-2]
+    line = FaultyLine([parse_fault(f"silent@2+{1.1 * turn:.4f}")])
+    actions, turns, _ = run(name, 4.0, line=_Muted(line))
+    ahead = -FAR if name.startswith("ydlidar") else 0.0
+    scans = [s for s in of_kind(actions, LaserScan)[5:] if not 1001.8 < s.stamp < 1002.5]
+    assert max(map(abs, stamp_errors(scans, turns, ahead))) < 0.003
+    assert 1 <= sum(event.count for event in of_kind(actions, Lost)) <= 3
+
+
 class _Muted:
     """A line that lets nothing through while `silent` acts; what Plug does in tools/emulate.py."""
 

@@ -40,7 +40,8 @@ def test_a_recording_survives_a_folder(tmp_path):
     for name in ("anchor", "ranges", "quality"):
         np.testing.assert_array_equal(getattr(read.ranges, name), getattr(log.ranges, name))
     np.testing.assert_array_equal(read.scans.ranges, log.scans.ranges)
-    assert read.scans.angle_increment == 0.1
+    for name in ("angle_min", "angle_increment", "time_increment", "range_min", "range_max"):
+        assert getattr(read.scans, name) == getattr(log.scans, name), name
     assert read.mounting.laser_flipped is True
     assert read.mounting.anchor_heights == {'a,"b': 1.5}
     np.testing.assert_array_equal(read.mounting.T_base_laser, log.mounting.T_base_laser)

@@ -126,6 +126,20 @@ def test_speeds_of_wheels_are_integrated(tmp_path):
     assert format_of(str(tmp_path / "run.txt")) == "librsf"
 
 
+@pytest.mark.parametrize("line", ["odom2diff 0.1 0.4 0.6 0.2 0 0 0", "odom2 0.1 0.5 0 1", "range2 0.1 2.5 0.1 3.0 4.0 105"])
+def test_a_line_of_librsf_needs_no_more_words_than_are_read(tmp_path, line):
+    """With one word less it is refused, with the words that must be there it is read."""
+    kind, *words = line.split()
+    before = "odom2 0.0 0.5 0 1 0 0 0\n"
+    (tmp_path / "run.txt").write_text(f"{before}{line}\n")
+    log = read_librsf(tmp_path / "run.txt")
+    assert len(log.odometry.stamps) == 1 + (kind != "range2")
+    assert (log.ranges is not None) is (kind == "range2")
+    (tmp_path / "run.txt").write_text(f"{before}{kind} {' '.join(words[:-1])}\n")
+    with pytest.raises(FormatError, match=f":2: {kind} has {len(words)} words, expected {len(words) + 1}"):
+        read_librsf(tmp_path / "run.txt")
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [

@@ -193,6 +193,16 @@ def test_rays_farther_apart_than_a_third_of_a_metre_are_of_no_piece(apart, piece
     assert len(found.length) == pieces
 
 
+@pytest.mark.parametrize("wall", [[2.0, -0.7, 3.5, -0.7], [0.1, -0.3, 4.0, -0.3]])
+def test_rays_count_down_to_a_cosine_of_incidence_of_a_seventh(wall):
+    """All of a wall 0.7 m beside the way, from 2 to 3.5 m ahead; of one beside the robot 2 m of 4."""
+    pieces, on = straight_pieces(seen([wall], np.zeros((1, 3)), beams=5760, reach=6.0))
+    assert len(pieces.length) == 1
+    aside = -wall[1]
+    farthest = min(wall[2], aside * np.sqrt(0.15**-2 - 1.0))
+    assert on.points[:, 0].max() == pytest.approx(farthest, rel=0.05)
+
+
 @pytest.mark.parametrize(("wall", "noise", "count"), [
     ([[1.0, -1.0, 4.0, -1.0]], 0.01, 1), ([[3.0, -0.35, 5.0, -0.35]], 0.01, 0), ([[2.0, -0.12, 2.0, 0.12]], 0.06, 0),
 ])  # fmt: skip
