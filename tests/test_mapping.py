@@ -26,7 +26,7 @@ from uwblite.pipeline.estimate import Task
 from uwblite.problem.solution import at_given_poses
 from uwblite.radio.anchor_covariance import anchors_with_correlated_errors
 from uwblite.screening.screen import screen
-from uwblite.sensor_log import Odometry, UwbRanges
+from uwblite.sensor_log import Odometry, SensorLog, SensorMounting, UwbRanges
 
 ROOM_ATE = 0.02
 """m. Lidar noise of 10 mm, shared by tens of rays per wall and by the pairs that see it, leaves key poses a few millimetres;
@@ -387,6 +387,22 @@ def test_a_large_grid_is_announced_and_may_be_declined(minute, monkeypatch):
     with pytest.raises(Cancelled, match="MB"):
         build_map(minute.crop(end=6.0), progress=decline)
     assert reported.count("occupancy grid") == 0
+
+
+def test_wheels_in_another_unit_are_multiplied_by_what_the_ranges_show():
+    rng, unit = np.random.default_rng(3), 1.3
+    stamps, truth = wander(rng, 30.0)
+    places = np.array([[6.0, 4.5], [-6.0, 4.0], [5.5, -4.5], [-5.0, -4.0]])
+    radio = ranges(rng, stamps, truth, places, rate=3.0, sigma=0.05)
+    wheels = odometry(stamps, truth, rng, scale=1.0 / unit, noise=0.01, turn_noise=0.01)
+    result = build_map(SensorLog(wheels, radio, None, SensorMounting(anchor_height=0.0)))
+    (finding,) = [f for f in result.findings if f.kind == "odometry-unit"]
+    assert finding.figures["factor"] == pytest.approx(unit, abs=0.02)
+    way = np.hypot(*np.diff(result.trajectory[:, :2], axis=0).T).sum()
+    assert way == pytest.approx(np.hypot(*np.diff(truth[:, :2], axis=0).T).sum(), rel=0.02)
+    # What was multiplied by the factor is no scale that is left.
+    (scale,) = [c for c in result.calibration if c.name == "odometry_scale"]
+    assert abs(scale.value) < 0.03
 
 
 @pytest.mark.slow

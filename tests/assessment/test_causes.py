@@ -103,6 +103,12 @@ def test_the_rules_of_all_ranges_are_asked_again_without_the_times_of_a_cause(be
     assert (("anchor-distrusted", "A") not in left) == gone
 
 
+def test_without_ranges_nothing_is_left_of_what_they_said():
+    view = replace(planted_view(np.zeros(400, dtype=bool)), table={})
+    view = replace(view, estimate=replace(view.estimate, ranges=None))
+    assert _left_without(view, replace(doubt("path-displaced", ""), stretches=((0.0, 1.0),))) == set()
+
+
 def test_what_is_explained_is_folded_under_the_first_cause_of_all():
     doubts = [doubt(kind, "") for kind in ("uncertain", "range-scatter", "clock-set-back")]
     found = explained([*doubts, warning("gyro", "")])

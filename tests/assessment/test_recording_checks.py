@@ -7,10 +7,10 @@ import pytest
 from helpers.room_recording import recording, two_rounds
 
 from uwblite.assessment import facts
-from uwblite.assessment.recording import diagnose
+from uwblite.assessment.recording import diagnose, screened
 from uwblite.assessment.sensor_checks import check_sensors
-from uwblite.findings import doubt, warning
-from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting
+from uwblite.findings import Fact, doubt, warning
+from uwblite.sensor_log import LaserScans, LogNotes, Odometry, OdometryBreaks, Screening, SensorLog, SensorMounting
 
 PER_RANGE = ("stamps", "anchor", "ranges", "quality")
 
@@ -66,6 +66,27 @@ def test_units_and_axes_of_the_wheels(without_scans):
     assert_named(with_poses(without_scans, np.column_stack([poses[:, :2], np.degrees(poses[:, 2])])), "doubt", "degrees")
     assert_named(with_poses(without_scans, poses * (1, 1, -1)), "warning", "turns against its path")
     assert_named(with_poses(without_scans, poses * (1e-3, 1e-3, 1)), "doubt", "hardly moves")
+
+
+def test_wheels_against_the_lidar_are_a_warning_until_a_map_judges_them_by_the_ranges(without_scans):
+    """Other doubts of the screening are the map's as well."""
+    against = Fact.of("wheels-against-lidar", start=0.0, stretches=((1.0, 5.0),), slips=False)
+    slow = Fact.of("hardly-moving", way=0.1, seconds=100.0, turned=0.1)
+    screening = Screening((against, slow), OdometryBreaks.none())
+    found = {f.kind: f for f in diagnose(without_scans, repaired=replace(without_scans, screening=screening)).findings}
+    assert found["wheels-against-lidar"].severity == "warning"
+    assert "unless its ranges agree with the lidar" in found["wheels-against-lidar"].cure
+    assert found["hardly-moving"].severity == "doubt"
+    assert "the map will be doubted" in found["hardly-moving"].cure
+
+
+def test_what_the_screening_refuses_is_examined_as_it_was_read(without_scans):
+    late = replace(without_scans.odometry, stamps=1e9 * without_scans.odometry.stamps)
+    wrong = replace(without_scans, odometry=late)
+    assert screened(wrong) is None
+    assert screened(without_scans).screening is not None
+    assert "equal-stamps" not in {f.kind for f in diagnose(wrong, refused="the stamps are wrong").findings}
+    assert_named(wrong, "doubt", "the stamps are wrong", refused="the stamps are wrong")
 
 
 def test_jumps_gaps_and_equal_stamps(without_scans):

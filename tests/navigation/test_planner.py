@@ -124,6 +124,21 @@ def test_a_large_map_is_searched_in_parts_and_what_is_connected_stays_so(monkeyp
     assert np.mean(dearer) < 1.05
 
 
+@pytest.mark.parametrize("door", [0, 8])
+def test_from_one_half_of_a_large_map_to_the_other_there_is_a_path_where_there_is_a_door(monkeypatch, door):
+    monkeypatch.setattr(steps, "AT_ONCE", 2500)
+    log_odds = np.full((100, 140), -4.0, dtype=np.float32)
+    log_odds[:, 70:73] = 4.0
+    log_odds[40 : 40 + door, 70:73] = -4.0
+    planner = make_planner(OccupancyGrid(GridGeometry(0.05, np.zeros(2), *log_odds.shape), log_odds), RADIUS)
+    assert planner.steps.regions is not None
+    places = np.array([[1.0, 1.0], [6.0, 4.0]])
+    first, last = (int(planner._beside(place)) for place in places)
+    assert (planner.steps.path(first, last) is None) == (door == 0)
+    reached = np.concatenate(list(planner.steps.reachable(first)))
+    assert (last in reached) == (door > 0)
+
+
 @pytest.mark.parametrize("unknown", ["refuse", "price"])
 def test_a_long_corridor_is_hardly_searched_and_its_path_is_as_cheap(monkeypatch, unknown):
     """Three legs of 50 m, 1.8 m wide: where the way is open for long, no cell is searched."""

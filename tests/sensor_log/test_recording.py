@@ -7,7 +7,18 @@ import pytest
 from helpers.planted import box, odometry, ranges, recording, scans, wander
 
 from uwblite.errors import DataError
-from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word, plausible
+from uwblite.sensor_log import (
+    LaserScans,
+    Odometry,
+    OdometryBreaks,
+    Screening,
+    SensorLog,
+    SensorMounting,
+    UwbRanges,
+    fault_of_id,
+    one_word,
+    plausible,
+)
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +40,20 @@ def test_a_part_holds_what_lies_within_its_ends(log):
     assert stated == [log.ranges.anchor_ids[k] for k in log.ranges.anchor[inside]]
     assert part.ranges.anchor_ids == ("A00",)
     assert len(log.crop().odometry.stamps) == len(log.odometry.stamps)
+
+
+def test_lengths_of_the_odometry_are_multiplied_with_all_that_is_said_of_them(log):
+    """Headings stay, and so does what other sensors measured."""
+    breaks = OdometryBreaks(log.odometry.stamps[[3, 9]], np.array([[0.2, 0.3, 0.1], [1.0, 2.0, 0.5]]))
+    screened = replace(log, screening=Screening((), breaks, lidar_by_wheels=1.2))
+    for before in (log, screened):
+        after = before.with_odometry_times(1.5)
+        np.testing.assert_allclose(after.odometry.poses, before.odometry.poses * [1.5, 1.5, 1.0])
+        assert after.ranges is before.ranges
+        assert after.scans is before.scans
+    np.testing.assert_allclose(after.screening.breaks.sigma, [[0.3, 0.45, 0.1], [1.5, 3.0, 0.5]])
+    np.testing.assert_array_equal(after.screening.breaks.stamps, breaks.stamps)
+    assert after.screening.lidar_by_wheels == pytest.approx(0.8)
 
 
 def test_a_part_without_scans_or_ranges_is_a_recording_too(log):
