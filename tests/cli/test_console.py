@@ -1,10 +1,14 @@
 """The console: what goes where, the bar on a terminal only, readers that leave early."""
 
 import io
+import logging
 
 import pytest
+from helpers.results import small_log, small_result
 
-from uwblite.cli import console
+from uwblite.cli import console, main
+from uwblite.io.result_text import RunRecord
+from uwblite.io.results import write_result
 
 
 class Terminal(io.StringIO):
@@ -89,3 +93,18 @@ def test_operating_system_errors_report_the_way_out():
     assert console.os_error_text(FileNotFoundError(2, "No such file or directory", "x.log")) == (
         "x.log: No such file or directory; check the spelling"
     )
+
+
+def test_how_much_is_said_is_chosen_by_every_command_anew(tmp_path, capsys):
+    """Quiet, it says of two recordings in one map nothing beside its result; the next command does."""
+    record = RunRecord("uwblite map run.log again.log", "")
+    write_result(tmp_path / "map", [small_log(), small_log(name="again.log")], small_result(each=2), record)
+    for words, said in ((["-q"], False), ([], True), (["--quiet"], False)):
+        assert main(["convert", str(tmp_path / "map"), str(tmp_path / "path.tum"), "--force", *words]) == 0
+        output = capsys.readouterr()
+        assert ("holds 2 trajectories" in output.err) is said
+        assert "24 poses" in output.out
+    levels = {(): logging.WARNING, ("-v",): logging.INFO, ("-vv",): logging.DEBUG, ("-q",): logging.ERROR}
+    for words, level in levels.items():
+        assert main(["convert", str(tmp_path / "map"), str(tmp_path / "path.tum"), "--force", *words]) == 0
+        assert logging.getLogger("uwblite").level == level

@@ -4,8 +4,10 @@ import json
 import os
 import re
 import shutil
+import signal
 import time
 import urllib.request
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -247,3 +249,28 @@ def test_the_page_shows_a_log_that_grows(tmp_path, room_log, width, dark):
         assert browser.run("document.documentElement.scrollWidth") <= width
         assert browser.complaints == []
         time.sleep(0.1)
+
+
+def test_a_watch_that_is_told_to_end_does_so_as_by_ctrl_c(tmp_path, monkeypatch, capsys):
+    """A service manager sends SIGTERM: the page ends, and the round that runs is stopped."""
+    before, asked, closed = signal.getsignal(signal.SIGTERM), [], []
+
+    def told(self, now):
+        asked.append(now)
+        assert len(asked) == 1, "it goes on"
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(watch.Watch, "step", told)
+    monkeypatch.setattr(watch.Watch, "close", lambda self: closed.append(self))
+    monkeypatch.setattr(watch, "serving", lambda page, *_: nullcontext("http://127.0.0.1:1/"))
+    monkeypatch.setattr(os, "nice", lambda by: 0)
+    (tmp_path / "run.log").write_text(odom_lines(1000.0, 1010.0))
+    try:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        assert main(["watch", str(tmp_path / "run.log")]) == 0
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    output = capsys.readouterr()
+    assert "open http://127.0.0.1:1/" in output.out
+    assert "the page has ended" in output.err
+    assert len(closed) == 1

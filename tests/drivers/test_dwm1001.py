@@ -92,6 +92,15 @@ def test_a_frame_cut_anywhere_does_not_take_the_next_one_with_it():
         assert events[-1] == Status(2), cut
 
 
+def test_after_a_reset_nothing_that_was_half_received_counts():
+    half, whole = b"\x40\x01\x00" + tag_block(READINGS)[:40], bytes.fromhex("4001005a020300")
+    protocol = TlvProtocol()
+    protocol.feed(half, 1.0)
+    protocol.reset()
+    assert protocol.feed(whole, 1.1) == feed_whole(TlvProtocol, whole)
+    assert protocol.feed(tag_block(READINGS)[40:], 1.2) == TlvProtocol().feed(tag_block(READINGS)[40:], 1.2)
+
+
 def test_position_may_be_missing_and_so_may_anchors():
     (_, event) = good(feed_whole(TlvProtocol, b"\x40\x01\x00" + tag_block(READINGS)))
     assert event.readings == RANGES

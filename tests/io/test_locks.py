@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -22,6 +23,24 @@ def test_a_second_run_is_reported_at_once(tmp_path):
             pass
     with sole_writer(tmp_path / "map"):
         pass
+
+
+def test_a_link_in_place_of_a_lock_is_not_followed(tmp_path, monkeypatch):
+    """Whoever may write the folder of temporary files could have files made elsewhere by that."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with sole_writer("map"):
+        (lock,) = tmp_path.iterdir()
+    lock.symlink_to(tmp_path / "elsewhere")
+    with sole_writer("map"):
+        assert not (tmp_path / "elsewhere").exists()
+
+
+def test_a_lock_is_not_inherited_by_other_programs(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with sole_writer("map"):
+        (lock,) = tmp_path.iterdir()
+        (handle,) = [int(f.name) for f in Path("/proc/self/fd").iterdir() if f.exists() and f.samefile(lock)]
+        assert not os.get_inheritable(handle)
 
 
 def test_a_killed_run_leaves_no_lock(tmp_path):

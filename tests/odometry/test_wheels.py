@@ -199,6 +199,14 @@ def test_a_slip_and_steps_that_are_off_in_a_row_are_no_late_scan():
     assert np.flatnonzero(displaced(off)).tolist() == [40]
 
 
+@pytest.mark.parametrize(("turned", "found"), [(0.22, [40]), (0.28, [])])
+def test_a_displaced_scan_leaves_half_of_its_way_at_most_and_a_turn_counts_two_metres_away(turned, found):
+    """A metre into it and back, and a turn that is left."""
+    off = 1e-3 * np.random.default_rng(0).standard_normal((90, 3))
+    off[40:42] += [[1.0, 0.0, 0.0], [-1.0, 0.0, turned]]
+    assert np.flatnonzero(displaced(off)).tolist() == found
+
+
 def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():
     """Steps in a corridor repeat what the wheels count along it; across and in heading the wheels err four times as much."""
     rng = np.random.default_rng(2)
