@@ -181,3 +181,19 @@ def test_something_to_judge_by_is_needed(result, capsys):
     _, (verb, folder, *_) = result
     assert main([verb, folder]) == 2
     assert "give --truth, --relations, or both" in capsys.readouterr().err
+
+
+def test_a_recording_that_a_map_does_not_have_is_named(result, capsys):
+    root, words = result
+    (root / "relations").write_text("100.1 101.2 0.5 0 0 0 0 0.3\n")
+    assert main([*words[:2], "--relations", str(root / "relations"), "--recording", "3"]) == 1
+    assert "is a map of 1 recordings, not of 3" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--anchors", "--landmarks"])
+def test_what_is_judged_by_the_truth_needs_it(result, capsys, option):
+    root, words = result
+    (root / "relations").write_text("100.1 101.2 0.5 0 0 0 0 0.3\n")
+    judged = [option, str(root / "anchors.csv")]
+    assert main([*words[:2], "--relations", str(root / "relations"), *judged]) == 2
+    assert "need --truth" in capsys.readouterr().err

@@ -16,7 +16,7 @@ from helpers.localization_room import ANCHORS, ROUND, SCANNER, cast, grid_of, kn
 from helpers.virtual_recording import live_devices
 
 from uwblite import se2
-from uwblite.cli import main
+from uwblite.cli import live, main
 from uwblite.cli.live import line_of
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.map_server import write_map
@@ -72,6 +72,31 @@ def test_ages_are_said_to_a_tenth_of_a_second():
     state = LocalizerState(1.0, none, np.eye(3), 1.0, none, False, age=0.123, silent={"lidar": 6.04})
     said = json.loads(line_of(state))
     assert (said["age"], said["silent"]) == (0.1, {"lidar": 6.0})
+
+
+def test_what_else_is_known_of_a_pose_is_in_its_line_and_nothing_where_nothing_is():
+    none = np.zeros(3)
+    state = LocalizerState(1.0, none, np.eye(3), 1.0, none, False)
+    assert set(json.loads(line_of(state))) == {"stamp", "pose", "covariance", "quality", "lost", "age", "odometry"}
+    others = np.arange(30.0).reshape(10, 3)
+    more = dataclasses.replace(state, reason="two places", alternatives=others, moved_anchors=("A", "B"))
+    said = json.loads(line_of(more))
+    assert (said["reason"], said["moved_anchors"]) == ("two places", ["A", "B"])
+    assert said["alternatives"] == others[: len(said["alternatives"])].tolist()
+
+
+def test_a_map_without_anchors_or_walls_is_said_to_be_one(capsys):
+    room = known()
+    live._tell_map(dataclasses.replace(room, anchors=room.anchors.only(())))
+    assert "by the walls alone" in capsys.readouterr().err
+    live._tell_map(dataclasses.replace(room, walls=None))
+    assert "by the anchors alone" in capsys.readouterr().err
+
+
+def test_a_log_without_measurements_is_said_to_have_none(room, tmp_path, capsys):
+    (tmp_path / "empty.log").write_text("# CARMEN Logfile\n")
+    assert main(["localize", str(tmp_path / "empty.log"), "--live", "--map", str(room[0]), "--idle", "0.2"]) == 3
+    assert "the log holds no measurement" in capsys.readouterr().err
 
 
 @pytest.fixture

@@ -1,12 +1,14 @@
 """`uwblite view` as a user starts it, and in Chromium: a closure is rejected with a click and the map made again."""
 
 import shutil
+from types import SimpleNamespace
 
 import pytest
 from helpers.browser import CHROMIUM, Browser
+from helpers.results import small_folder
 from helpers.served import Served
 
-from uwblite.cli import main
+from uwblite.cli import main, view
 from uwblite.io.constraints_file import parse_constraints
 
 
@@ -64,3 +66,29 @@ def test_a_click_rejects_a_closure_and_maps_again(mapped, tmp_path, width, dark)
         browser.until("document.getElementById('say').textContent.length > 0")
         assert browser.complaints == []
     assert (mapped / "map_2" / "map.png").is_file()
+
+
+@pytest.mark.parametrize("job", [None, "runs", "has ended"])
+def test_a_page_that_ends_ends_the_map_that_it_makes(tmp_path, monkeypatch, capsys, job):
+    """It reports where it is, and opens a browser where one is wanted."""
+    small_folder(tmp_path / "map")
+    seen = []
+    child = SimpleNamespace(code=lambda: None if job == "runs" else 0, stop=lambda: seen.append("stopped"))
+
+    def serve(poll_interval):
+        seen.append("served")
+        raise KeyboardInterrupt
+
+    def server_for(app, port):
+        app.host, app.job = f"127.0.0.1:{port}", None if job is None else child
+        return SimpleNamespace(serve_forever=serve, server_close=lambda: seen.append("closed"))
+
+    monkeypatch.setattr(view, "server_for", server_for)
+    monkeypatch.setattr("webbrowser.open", seen.append)
+    assert main(["view", str(tmp_path / "map"), "--port", "8123", *(["--open"] if job is None else [])]) == 0
+    opened, stopped = ["http://127.0.0.1:8123/"] if job is None else [], ["stopped"] if job == "runs" else []
+    assert seen == [*opened, "served", *stopped, "closed"]
+    output = capsys.readouterr()
+    assert output.out == "open http://127.0.0.1:8123/ in a browser; Ctrl-C ends it\n"
+    assert f"corrections go to {tmp_path / 'map'}_constraints.toml" in output.err
+    assert "the page has ended" in output.err
