@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 from conftest import ROOT
@@ -221,3 +222,14 @@ def test_libraries_that_are_loaded_need_room_for_their_buffers_alone(left, fits)
     done = subprocess.run(words, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}, capture_output=True, text=True, check=False)
     assert (done.returncode == 0) == fits, done.stderr
     assert ("NoRoom" in done.stderr) != fits
+
+
+@pytest.mark.parametrize(("platform", "gives"), [("linux", True), ("darwin", False), ("win32", False)])
+def test_free_memory_is_given_back_where_the_system_has_a_way(monkeypatch, platform, gives):
+    monkeypatch.setattr("sys.platform", platform)
+    monkeypatch.setattr("ctypes.CDLL", lambda name: SimpleNamespace(malloc_trim=lambda pad: 1))
+    memory._trim.cache_clear()
+    try:
+        assert (memory._trim() is not None) is gives
+    finally:
+        memory._trim.cache_clear()

@@ -65,7 +65,8 @@ def test_lines_that_are_read_together_are_those_that_are_read_one_by_one(lines):
         assert (layout, mine.seen) == (other, others.seen)
         assert sorted(mine.numbers) == sorted(others.numbers)
         np.testing.assert_array_equal(np.sort(mine.ranges), np.sort(others.ranges))
-    assert sorted(together.laser._poses) == sorted(one_by_one.laser._poses)
+    poses = [np.column_stack(reader.laser.robot_poses()).tolist() for reader in (together, one_by_one)]
+    assert sorted(poses[0]) == sorted(poses[1])
 
 
 def test_a_message_that_ends_with_its_first_reading_is_too_short():

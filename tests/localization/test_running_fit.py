@@ -85,3 +85,18 @@ def test_a_range_that_agrees_by_chance_does_not_hide_since_when_in_doubt():
     assert fit.in_doubt()
     assert not fit.scans_contradict()
     assert (fit.matched, fit.sound) == (2.0, 4.0)
+
+
+def test_a_pose_that_is_found_anew_has_the_agreement_of_all_anchors():
+    """What was held against them at another pose does not count; walls support it where it was found by them."""
+    fit = after(*[(k % 4, CONTRADICTS) for k in range(8)])
+    assert fit.jumped()
+    for sees in (True, False):
+        fit.restart(sees)
+        assert not fit.jumped()
+        assert not fit.ranges_contradict()
+        assert len(fit.moved_anchors()) == 0
+        assert (fit.scans > 0.0) is sees
+    for anchor in range(2):
+        fit.add_range(anchor, *CONTRADICTS, 20.0 + anchor)
+        assert fit.jumped() == (anchor == 1)
