@@ -69,6 +69,20 @@ def test_lines_that_are_read_together_are_those_that_are_read_one_by_one(lines):
     assert sorted(poses[0]) == sorted(poses[1])
 
 
+def test_poses_of_messages_that_are_read_together_have_the_numbers_of_their_lines():
+    def line(k):
+        return f"FLASER 2 1.0{k} 2.00 {k}.5 0 0 {k}.5 {k}.25 0.5 {k}.0 r {k}.0\n"
+
+    reader = LogReader("log", 2, 1.0)
+    reader.feed(f"ODOM 0 0 0 0 0 0 1 r 1\n{line(1)}".encode())
+    reader.feed("".join(line(k) + "# between\n" for k in range(2, 8)).encode())
+    poses, lines = reader.laser.robot_poses()
+    assert lines.tolist() == [2, *range(3, 15, 2)]
+    np.testing.assert_array_equal(poses, [[k, k + 0.5, k + 0.25, 0.5] for k in range(1, 8)])
+    (scans,) = reader.laser._scans.values()
+    assert list(scans.numbers) == [2, 5, 9, 13]
+
+
 def test_a_message_that_ends_with_its_first_reading_is_too_short():
     """Alone of its kind in a block, it would be taken with others that begin alike: there is no blank behind the first."""
     head = b"RAWLASER1 0 0 1 0.1 8 0 0 2 "
