@@ -1,13 +1,14 @@
 """What explains ranges that do not fit the path: planted clocks, names and wheels, and sound ones."""
 
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import pytest
 from helpers import planted
 
 from uwblite import se2
-from uwblite.screening.range_explanations import _best_place, _by_way, _traces, explained_by_ranges
+from uwblite.screening.range_explanations import Stretches, _best_order, _best_place, _traces, explained_by_ranges
 from uwblite.sensor_log import Odometry, SensorLog
 
 CORNERS = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
@@ -198,8 +199,35 @@ def test_the_likelihood_of_ranges_along_a_path_is_that_of_the_best_place():
 
 def test_the_density_of_changes_by_way_is_a_density():
     """Over all values of the second range it integrates to 1, by the prior of the first."""
-    trace = _traces(late_by(0.0))[0].between(0.0, 5.0)
-    trace = replace(trace, ranges=trace.ranges[:2], way=trace.way[:2])
+    stretches = Stretches.of(_traces(late_by(0.0)), np.zeros(1), np.full(1, 5.0)).rows(slice(0, 1))
     values, step = np.linspace(-100.0, 110.0, 10501, retstep=True)
-    each = [_by_way(replace(trace, ranges=np.array([5.0, v])), 10.0)[0] for v in values]
+    two = replace(stretches, counted=np.ones((1, 2)), way=stretches.way[:, :2])
+    each = [replace(two, ranges=np.array([[5.0, v]])).driven(10.0)[0, 0] for v in values]
     assert np.exp(each).sum() * step * 10.0 == pytest.approx(1.0, abs=0.01)
+
+
+def test_what_fills_up_a_stretch_counts_for_nothing():
+    """Of each stretch the readings alone: the same whichever stretches are beside it."""
+    traces = _traces(late_by(0.0))
+    begins = np.arange(0.0, 50.0, 2.5)
+    ends = begins + np.linspace(4.0, 9.0, len(begins))
+    together = Stretches.of(traces, begins, ends)
+    assert (together.counted.min(axis=1) == 0.0).any()
+    for row in range(len(together.trace)):
+        own, number = traces[together.trace[row]], together.number[row : row + 1]
+        there = (own.way > begins[number]) & (own.way <= ends[number])
+        alone = Stretches.of([own], begins[number], ends[number])
+        assert there.sum() == together.counts[row] == alone.counts[0]
+        assert set(together.stamps[row][together.counted[row] > 0.0]) == set(own.stamps[there])
+        for of in (lambda s: s.likely, lambda s: s.driven(20.0), lambda s: s.nothing(20.0)):
+            np.testing.assert_allclose(of(together)[row], of(alone)[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 6])
+def test_the_best_order_of_anchors_is_that_of_all(count):
+    rng = np.random.default_rng(count)
+    every = [list(order) for order in permutations(range(count))]
+    for pairs in [*10.0 * rng.normal(size=(20, count, count)), *rng.integers(0, 3, (20, count, count)).astype(float)]:
+        best = _best_order(pairs)
+        assert sorted(best.tolist()) == list(range(count))
+        assert pairs[range(count), best].sum() == pytest.approx(max(pairs[range(count), order].sum() for order in every))

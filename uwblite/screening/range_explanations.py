@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import CHUNK, Bools, Floats, Ints, Table, chunks
 from ..findings import Fact
 from ..problem.alternatives import EvidencePolicy
 from ..sensor_log import SHORTEST_RANGE, SensorLog, plausible
@@ -71,11 +71,6 @@ class Trace:
     """(n,) travelled by the wheels, m."""
     places: Floats
     """(n, 2) of the base by the wheels, m."""
-
-    def between(self, begin: float, end: float) -> "Trace":
-        """Return the readings on a stretch of the way, m, its end included."""
-        own = (self.way > begin) & (self.way <= end)
-        return Trace(self.anchor, self.stamps[own], self.ranges[own], self.way[own], self.places[own])
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,13 +176,15 @@ def _without_antenna_delays(log: SensorLog, traces: Sequence[Trace]) -> tuple[Se
     names, offsets = log.ranges.anchor_ids, PathPolicy.antenna_delay * np.array([0.0, 1.0, 2.0])
     units = np.append(np.ones_like(offsets), list(LENGTHS.values()))
     offsets = np.append(offsets, np.zeros(len(LENGTHS)))
-    likely = np.zeros((len(names), len(PathPolicy.noise), len(offsets)))
-    for own in _stretches(log, traces):
-        for trace in own:
-            ranges = units[:, None] * trace.ranges - offsets[:, None]
-            paths = np.broadcast_to(trace.places, (*ranges.shape, 2))
-            of_place = _best_place(paths, ranges, np.ones_like(ranges)) + len(trace.ranges) * np.log(units)
-            likely[names.index(trace.anchor)] += np.where(np.median(ranges, axis=1) > 0.0, of_place, -np.inf)
+    likely, every = np.zeros((len(names), len(PathPolicy.noise), len(offsets))), Stretches.of(traces, *_along(log))
+    for stretches in every.chunks(len(offsets)):
+        ranges = units[:, None] * stretches.ranges[:, None] - offsets[:, None]
+        counted = np.broadcast_to(stretches.counted[:, None], ranges.shape)
+        of_place = _best_place(np.broadcast_to(stretches.places[:, None], (*ranges.shape, 2)), ranges, counted)
+        of_place += stretches.counts[:, None] * np.log(units)
+        distances = np.einsum("...n,...n", ranges > 0.0, counted) > 0.5 * stretches.counts[:, None]
+        anchor = np.array([names.index(traces[k].anchor) for k in stretches.trace.tolist()])
+        np.add.at(likely, anchor, np.where(distances, of_place, -np.inf).swapaxes(0, 1))
     metres, others = np.split(likely.max(axis=1), [len(offsets) - len(LENGTHS)], axis=1)
     shown = metres.max(axis=1) > metres[:, 0] - np.log(PathPolicy.fault) + EvidencePolicy.very_strong
     delays = np.where(shown, offsets[metres.argmax(axis=1)], 0.0)
@@ -207,21 +204,18 @@ def _late(log: SensorLog, traces: Sequence[Trace]) -> Explanation:
     """Return a radio's clock that is off throughout, by a constant or by one that grows evenly; its rivals are wheels with
     another scale throughout or that slip on some stretches, and ranges that are any numbers."""
     offsets, factors, slight = np.arange(-PathPolicy.most_late, PathPolicy.most_late + 0.5), PathPolicy.factors, 1.5
-    count, stretches, shares, counted = len(factors), list[Floats](), list[float](), 0
     longest, start = max(float(trace.ranges.max(initial=1.0)) for trace in traces), log.odometry.stamps[0]
-    for own in _stretches(log, traces):
-        stretches.append(_on_stretch(log, own, offsets, longest))
-        stamps = np.concatenate([trace.stamps for trace in own])
-        shares.append(float((stamps.mean() - start) / np.ptp(log.odometry.stamps)))
-        counted += len(stamps)
-    if not stretches:
+    every, count = Stretches.of(traces, *_along(log)), len(factors)
+    if not len(every.trace):
         return Explanation(-np.inf, "late-ranges", {})
-    each = np.stack(stretches, axis=1)
+    every = replace(every, number=np.unique(every.number, return_inverse=True)[1])
+    each, counts = _on_stretches(log, every, offsets, longest), np.bincount(every.number, every.counts)
+    middles = np.bincount(every.number, (every.stamps * every.counted).sum(axis=1)) / counts
     first, last = (offset.ravel() for offset in np.meshgrid(offsets, offsets))
     late = np.zeros((len(each), len(first)))
-    for k, share in enumerate(shares):
+    for k, share in enumerate(((middles - start) / np.ptp(log.odometry.stamps)).tolist()):
         late += each[:, k, count + np.rint(PathPolicy.most_late + first + (last - first) * share).astype(np.intp)]
-    nothing = -counted * float(np.log(longest))
+    nothing = -counts.sum() * float(np.log(longest))
     steady, sound = first == last, np.maximum(np.abs(first), np.abs(last)) < slight
     null = float(max(each[:, :, :count].sum(axis=1).max(), late[:, sound].max(), nothing))
     rows = list[Explanation]()
@@ -237,33 +231,96 @@ def _late(log: SensorLog, traces: Sequence[Trace]) -> Explanation:
     return max(rows, key=lambda row: row.log_odds)
 
 
-def _stretches(log: SensorLog, traces: Sequence[Trace]) -> Iterator[list[Trace]]:
-    """Yield the traces that have enough readings on each stretch of the way; none where no trace has."""
+def _along(log: SensorLog) -> tuple[Floats, Floats]:
+    """Return where the stretches that divide the way begin (s,) and end (s,), m."""
     length = PathPolicy.stretch
     edges = np.append(np.arange(0.0, max(log.odometry.travelled[-1] - length, 0.1), length), np.inf)
-    for begin, end in zip(edges[:-1] - 1e-9, edges[1:], strict=True):
-        parts = (trace.between(begin, end) for trace in traces)
-        if own := [part for part in parts if len(part.ranges) >= PathPolicy.fewest]:
-            yield own
+    return edges[:-1] - 1e-9, edges[1:]
 
 
-def _on_stretch(log: SensorLog, traces: Sequence[Trace], offsets: Floats, longest: float) -> Floats:
-    """Return log likelihoods (g, h) of traces on a stretch, for g scales of errors, if the way by the wheels has a factor, or
-    the radio's clock one of some offsets, s; longest: of all ranges, m.
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretches(Table):
+    """Readings of single anchors on stretches of the way, filled up to the most that one of them has."""
+
+    trace: Ints
+    """(p,) which trace they are of."""
+    number: Ints
+    """(p,) of the stretch."""
+    stamps: Floats
+    """(p, n) s."""
+    ranges: Floats
+    """(p, n) m."""
+    way: Floats
+    """(p, n) travelled by the wheels, m."""
+    places: Floats
+    """(p, n, 2) of the base, m."""
+    counted: Floats
+    """(p, n) 1 for a reading, 0 for what fills up."""
+    likely: Floats
+    """(p, g) log likelihoods of the readings to one place each."""
+
+    @staticmethod
+    def of(traces: Sequence[Trace], begins: Floats, ends: Floats) -> "Stretches":
+        """Fit a place to the readings of each trace on stretches (s,) to (s,), m, ends included, where there are enough."""
+        edges = np.stack([np.searchsorted(trace.way, [begins, ends], "right") for trace in traces], axis=1)
+        counts = edges[1] - edges[0]
+        trace, number = np.nonzero(counts >= PathPolicy.fewest)
+        many, starts = counts[trace, number][:, None], np.cumsum([0] + [len(trace.way) for trace in traces])
+        place = np.arange(many.max(initial=1))
+        counted = (place < many).astype(np.float64)
+        rows = (starts[trace] + edges[0, trace, number])[:, None] + np.minimum(place, many - 1)
+        stamps, ranges, way, places = (
+            np.concatenate([getattr(trace, name) for trace in traces])[rows] for name in ("stamps", "ranges", "way", "places")
+        )
+        return Stretches(trace, number, stamps, ranges, way, places, counted, _best_place(places, ranges, counted).T)
+
+    def chunks(self, paths: int) -> Iterator["Stretches"]:
+        """Yield as many rows at a time as can be compared with so many paths in a processor's cache."""
+        return (self.rows(part) for part in chunks(len(self.trace), max(CHUNK // (paths * self.ranges.shape[1]), 1)))
+
+    def seen(self, origin: Floats) -> "Stretches":
+        """Return the readings with places moved by a motion (3,)."""
+        return replace(self, places=se2.transform(origin, self.places))
+
+    @property
+    def counts(self) -> Floats:
+        """(p,) readings."""
+        return np.asarray(self.counted.sum(axis=1))
+
+    def driven(self, longest: float) -> Floats:
+        """Return log likelihoods (p, g) of the readings, of all the longest in m, if the robot drove its way or twice that."""
+        # A way shorter than the errors of ranges is lost in them.
+        change, way = np.diff(self.ranges)[:, None], np.maximum(np.diff(self.way), PathPolicy.noise[0])[:, None]
+        scales, counted = 2.0 * PathPolicy.noise[:, None], self.counted[:, None, 1:]
+
+        def within(most: Floats) -> Floats:
+            spread = np.arctan((change + most) / scales) - np.arctan((change - most) / scales)
+            return np.asarray(np.sum(np.log(spread / (2.0 * np.pi * most)) * counted, axis=2))
+
+        return np.asarray(np.logaddexp(within(way), within(2.0 * way)) - np.log(2.0) - np.log(longest))
+
+    def nothing(self, longest: float) -> Floats:
+        """Return log likelihoods (p, 1) of the readings if they may be any numbers up to the longest, m."""
+        return np.asarray(-self.counts[:, None] * float(np.log(longest)))
+
+
+def _on_stretches(log: SensorLog, every: Stretches, offsets: Floats, longest: float) -> Floats:
+    """Return log likelihoods (g, s, h) of s stretches, for g scales of errors, if the way by the wheels has a factor, or the
+    radio's clock one of some offsets, s; longest: of all ranges, m.
 
     Whatever the clock, on a stretch where the wheels slip only the way is known, or its path is any of these.
     """
-    likely = np.zeros((len(PathPolicy.noise), len(PathPolicy.factors) + len(offsets)))
-    lost = np.zeros((len(likely), 1))
-    stamps, poses = log.odometry.stamps, log.odometry.poses
-    for trace in traces:
-        shifted = trace.stamps + offsets[:, None]
-        places = np.stack([np.interp(shifted, stamps, poses[:, k]) for k in (0, 1)], axis=-1)
-        paths = np.concatenate([PathPolicy.factors[:, None, None] * trace.places, places])
-        likely += _best_place(paths, trace.ranges, np.ones(len(trace.ranges)))
-        lost += _by_way(trace, longest)[:, None]
-    of_any = np.logaddexp.reduce(likely, axis=1, keepdims=True) - np.log(likely.shape[1])
-    return np.asarray(np.logaddexp(likely, np.log(PathPolicy.wheels) + np.logaddexp(lost, of_any)))
+    odometry, factors = log.odometry, PathPolicy.factors[:, None, None]
+    likely = np.zeros((int(every.number.max()) + 1, len(PathPolicy.noise), len(factors) + len(offsets)))
+    lost = np.zeros((*likely.shape[:2], 1))
+    for some in every.chunks(likely.shape[2]):
+        shifted = some.stamps[:, None] + offsets[:, None]
+        places = np.stack([np.interp(shifted, odometry.stamps, odometry.poses[:, k]) for k in (0, 1)], axis=-1)
+        paths = np.concatenate([factors * some.places[:, None], places], axis=1)
+        np.add.at(likely, some.number, _best_place(paths, some.ranges[:, None], some.counted[:, None]).swapaxes(0, 1))
+        np.add.at(lost, some.number, some.driven(longest)[..., None])
+    of_any = np.logaddexp.reduce(likely, axis=2, keepdims=True) - np.log(likely.shape[2])
+    return np.asarray(np.logaddexp(likely, np.log(PathPolicy.wheels) + np.logaddexp(lost, of_any)).swapaxes(0, 1))
 
 
 def _at_moments(
@@ -273,86 +330,41 @@ def _at_moments(
 
     About each moment the readings of a stretch before and after it are compared, in the frame of the robot at that moment;
     where another explanation is given, at moments whose stretches meet its own. To compare recordings, other paths count which
-    are hardly likely enough to be told.
+    are hardly likely enough to be told. At most moments the path by the wheels leaves nothing to be explained.
     """
     odometry, half, rows = log.odometry, PathPolicy.stretch, list[Explanation]()
-    way, sides = odometry.travelled, dict[float, Side]()
+    way = odometry.travelled
+    moments = np.arange(half, float(way[-1]) - half, 0.25 * half)
+    if near is not None:
+        moments = moments[(moments + half > near.begin) & (near.end > moments - half)]
     longest = max(float(trace.ranges.max(initial=0.0)) for trace in traces)
-    for at in np.arange(half, float(way[-1]) - half, 0.25 * half).tolist():
-        if near is not None and (at + half <= near.begin or near.end <= at - half):
-            continue
-        # What is after one moment is before another.
-        for begin in (at - half, at):
-            if begin not in sides:
-                sides[begin] = Side.of([trace.between(begin, begin + half) for trace in traces], longest)
-        before, after = sides[at - half], sides[at]
-        own = np.flatnonzero(np.minimum(before.counts, after.counts) >= PathPolicy.fewest)
-        if len(own):
-            origin = se2.inverse(odometry.at(np.array([np.interp(at, way, odometry.stamps)]))[0])
-            moment = Moment(before.seen(origin, own), after.seen(origin, own), [traces[k].anchor for k in own.tolist()])
-            rows += [replace(row, begin=at - half, end=at + half) for row in moment.rows(to_compare)]
+    sides = [Stretches.of(traces, begins, begins + half) for begins in (moments - half, moments)]
+    one, other = (side.trace * len(moments) + side.number for side in sides)
+    before, after = sides[0].rows(np.isin(one, other)), sides[1].rows(np.isin(other, one))
+    each, likely = np.arange(len(before.trace)), np.zeros((len(moments), 2, len(PathPolicy.noise)))
+    as_driven = Moment(before, after, [], longest).same(each, each, np.zeros((1, 3)))[..., 0].T
+    np.add.at(likely, before.number, np.stack([as_driven, before.likely + after.likely], axis=1))
+    path, any_place = likely.max(axis=2).T
+    for k in np.flatnonzero(path < any_place - EvidencePolicy.very_strong).tolist():
+        own, at = np.flatnonzero(before.number == k), float(moments[k])
+        origin = se2.inverse(odometry.at(np.array([np.interp(at, way, odometry.stamps)]))[0])
+        names = [traces[k].anchor for k in before.trace[own].tolist()]
+        about = Moment(before.rows(own).seen(origin), after.rows(own).seen(origin), names, longest)
+        rows += [replace(row, begin=at - half, end=at + half) for row in about.rows(to_compare)]
     return rows
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Side:
-    """Readings of several anchors on one stretch, filled up to the most that one of them has."""
-
-    traces: Sequence[Trace]
-    """(a,) the readings of each."""
-    places: Floats
-    """(a, n, 2) of the base, m."""
-    ranges: Floats
-    """(a, n) m."""
-    counted: Floats
-    """(a, n) 1 for a reading, 0 for what fills up."""
-    likely: Floats
-    """(a, g) log likelihoods of the readings to one place each."""
-    longest: float
-    """Of all ranges, m."""
-
-    @staticmethod
-    def of(traces: Sequence[Trace], longest: float) -> "Side":
-        """Fill up the readings of each anchor and fit a place to them."""
-        counts = np.array([len(trace.ranges) for trace in traces])
-        there = np.arange(max(counts.max(), 1)) < counts[:, None]
-        places, ranges = np.zeros((*there.shape, 2)), np.ones(there.shape)
-        places[there] = np.concatenate([trace.places for trace in traces])
-        ranges[there] = np.concatenate([trace.ranges for trace in traces])
-        counted, enough = there.astype(np.float64), counts >= PathPolicy.fewest
-        likely = np.zeros((len(traces), len(PathPolicy.noise)))
-        likely[enough] = _best_place(places[enough], ranges[enough], counted[enough]).T
-        return Side(traces, places, ranges, counted, likely, longest)
-
-    def seen(self, origin: Floats, own: Ints) -> "Side":
-        """Return the readings of some anchors, places moved by a motion (3,)."""
-        places, traces = se2.transform(origin, self.places[own]), [self.traces[k] for k in own]
-        return Side(traces, places, self.ranges[own], self.counted[own], self.likely[own], self.longest)
-
-    @property
-    def counts(self) -> Floats:
-        """(a,) readings of each anchor."""
-        return np.asarray(self.counted.sum(axis=1))
-
-    @property
-    def driven(self) -> Floats:
-        """(a, g) log likelihoods of the readings where only the way is known."""
-        return np.array([_by_way(trace, self.longest) for trace in self.traces])
-
-    @property
-    def nothing(self) -> Floats:
-        """(a,) the same where ranges may be any numbers up to the longest."""
-        return np.asarray(-self.counts * float(np.log(self.longest)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
     """Readings of anchors before and after a moment."""
 
-    before: Side
-    after: Side
+    before: Stretches
+    after: Stretches
+    """(a,) of each anchor one."""
     names: list[str]
     """(a,) of the anchors."""
+    longest: float
+    """Of all ranges, m."""
 
     def likely(self, motions: Floats, sign: float = 1.0, names: Ints | None = None) -> Floats:
         """Return log likelihoods (m,) of a path that goes on by motions (m, 3), mirrored or not, and of anchors that are others
@@ -371,11 +383,17 @@ class Moment:
         apart = one.likely[k] + two.likely[other]
         return np.asarray(np.logaddexp(likely, np.log(PathPolicy.fault) + apart.T[:, :, None]))
 
-    def refined(self, motions: Floats, size: float, sign: float = 1.0, names: Ints | None = None) -> float:
-        """Return the log likelihood of the best motion about the best of some (m, 3), within a size, m, coarse to fine."""
-        best, most = motions[np.argmax(self.likely(motions, sign, names))], -np.inf
+    def refined(
+        self, motions: Floats, size: float, sign: float = 1.0, names: Ints | None = None, enough: float = np.inf
+    ) -> float:
+        """Return the log likelihood of the best motion about the best of some (m, 3), within a size, m, coarse to fine; of one
+        that is likely enough where there is."""
+        likely = self.likely(motions, sign, names)
+        best, most = motions[np.argmax(likely)], float(likely.max())
         around = np.stack(np.meshgrid(*3 * [np.array([-0.5, 0.0, 0.5])]), axis=-1).reshape(-1, 3)
         for reach in size * 0.5 ** np.arange(np.log2(size / PathPolicy.usual_motion) + 3.0):
+            if most > enough:
+                break
             likely = self.likely(best + around * reach, sign, names)
             best, most = best + around[np.argmax(likely)] * reach, float(likely.max())
         return most
@@ -412,9 +430,10 @@ class Moment:
         motions, usual = turns[:, None] * np.array([0.0, 0.0, 1.0]), np.abs(turns) < usual_motion
         small = motions[usual]
         sound = float((one.likely + two.likely).sum(axis=0).max()) - EvidencePolicy.very_strong
-        if float(self.likely(small).max()) > sound or (null := self.refined(small, usual_motion)) > sound:
+        null = self.refined(small, usual_motion, enough=sound)
+        if null > sound:
             return
-        ways = one.driven, two.driven
+        ways = one.driven(self.longest), two.driven(self.longest)
         lost = ways[0] + two.likely, one.likely + ways[1], ways[0] + ways[1]
         wheels = float(np.log(PathPolicy.wheels))
         unknown = max(float(side.sum(axis=0).max()) for side in lost)
@@ -449,8 +468,8 @@ class Moment:
             # The number of cycles of so many of the anchors.
             gain -= math.lgamma(count + 1.0) - math.lgamma(count - len(changed) + 1.0) - math.log(len(changed))
             yield Explanation(gain + prior, kind, {"exchanged": True, "anchors": changed}, names=names)
-        unordered = (one.nothing + two.likely.T, one.likely.T + two.nothing)
-        nowhere = max(float(side.sum(axis=1).max()) for side in unordered)
+        unordered = (one.nothing(self.longest) + two.likely, one.likely + two.nothing(self.longest))
+        nowhere = max(float(side.sum(axis=0).max()) for side in unordered)
         yield Explanation(nowhere + prior, kind, {"exchanged": False, "anchors": changed})
 
 
@@ -459,13 +478,31 @@ _WHEELS = "wheels-against-ranges"
 
 
 def _best_order(pairs: Floats) -> Ints:
-    """Return the order (a,) with the largest sum of values (a, a), one of each row and column."""
-    best = pairs.argmax(axis=1)
-    if len(np.unique(best)) == len(best):
-        return best
-    from scipy.optimize import linear_sum_assignment  # a twentieth of a second, which few recordings need
+    """Return the order (a,) with the largest sum of values (a, a), one of each row and column.
 
-    return np.asarray(linear_sum_assignment(-pairs)[1], dtype=np.intp)
+    Rows are placed one after another, each at the end of the shortest path of replacements (R. Jonker, A. Volgenant, A shortest
+    augmenting path algorithm for dense and sparse linear assignment problems, 1987); scipy.optimize takes longer to load.
+    """
+    column_of, row_of = np.full(len(pairs), -1), np.full(len(pairs), -1)
+    worth, price = pairs.max(axis=1), np.zeros(len(pairs))
+    for row in range(len(pairs)):
+        loss, before = worth[row] + price - pairs[row], np.full(len(pairs), row)
+        passed, holder = np.zeros(len(pairs), dtype=bool), row
+        while holder >= 0:
+            column = int(np.where(passed, np.inf, loss).argmin())
+            passed[column], holder = True, int(row_of[column])
+            if holder >= 0:
+                through = loss[column] + worth[holder] + price - pairs[holder]
+                shorter = ~passed & (through < loss)
+                loss[shorter], before[shorter] = through[shorter], holder
+        # At these prices no row on the path loses by its replacement.
+        held = passed & (row_of >= 0)
+        price[held] += loss[column] - loss[held]
+        worth[np.append(row_of[held], row)] -= loss[column] - np.append(loss[held], 0.0)
+        while holder != row:
+            holder = int(before[column])
+            row_of[column], column_of[holder], column = holder, column, int(column_of[holder])
+    return column_of
 
 
 def _best_place(paths: Floats, ranges: Floats, counted: Floats) -> Floats:
@@ -489,16 +526,3 @@ def _best_place(paths: Floats, ranges: Floats, counted: Floats) -> Floats:
     scales = PathPolicy.noise.reshape(-1, *(1,) * (errors.ndim - 1))
     off = np.einsum("...n,...n", np.log(1.0 + (errors / scales[..., None]) ** 2), counted)
     return np.asarray(-off - many * np.log(np.pi * scales) - 1.5 * np.log(many))
-
-
-def _by_way(trace: Trace, longest: float) -> Floats:
-    """Return log likelihoods (g,) of the ranges of a trace if the robot drove its way, or twice that, in any direction."""
-    # A way shorter than the errors of ranges is lost in them.
-    change, way = np.diff(trace.ranges), np.maximum(np.diff(trace.way), PathPolicy.noise[0])
-    scales = 2.0 * PathPolicy.noise[:, None]
-
-    def within(most: Floats) -> Floats:
-        spread = np.arctan((change + most) / scales) - np.arctan((change - most) / scales)
-        return np.asarray(np.sum(np.log(spread / (2.0 * np.pi * most)), axis=1))
-
-    return np.asarray(np.logaddexp(within(way), within(2.0 * way)) - np.log(2.0) - np.log(longest))
