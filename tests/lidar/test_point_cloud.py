@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from uwblite.errors import DataError
 from uwblite.lidar.point_cloud import (
     estimate_normals,
-    make_tree,
+    neighbour_pairs,
     radius_outlier_filter,
     statistical_outlier_filter,
     voxel_filter,
@@ -86,10 +86,26 @@ def test_filters_take_a_lone_outlier_and_leave_the_wall():
         assert keep.tolist() == [True] * 61 + [False]
 
 
+def lines_of(points, radius):
+    return estimate_normals(points, *neighbour_pairs(np.zeros(len(points), dtype=np.int64), points, radius))
+
+
+@settings(max_examples=25, deadline=None)
+@given(clouds, st.floats(0.1, 3.0), st.integers(1, 3))
+def test_neighbours_are_the_pairs_of_one_owner_within_the_radius(points, radius, owners):
+    owner = np.arange(len(points)) % owners
+    distances = _distances(points)
+    if (np.abs(distances - radius) < 1e-9).any():
+        return
+    pairs = np.sort(neighbour_pairs(owner, points, radius), axis=0).T
+    near = (distances <= radius) & (owner == owner[:, None]) & (np.arange(len(points)) > np.arange(len(points))[:, None])
+    assert sorted(pairs.tolist()) == np.argwhere(near).tolist()
+
+
 @settings(max_examples=25, deadline=None)
 @given(clouds, st.floats(0.1, 3.0))
 def test_lines_equal_the_eigenvectors_of_each_neighbourhood(points, radius):
-    lines = estimate_normals(points, make_tree(points), radius)
+    lines = lines_of(points, radius)
     distances = _distances(points)
     if (np.abs(distances - radius) < 1e-9).any():
         return
@@ -111,7 +127,7 @@ def test_lines_equal_the_eigenvectors_of_each_neighbourhood(points, radius):
 def test_linearity_shows_walls_from_corners_and_lone_points():
     along = np.arange(0.0, 1.001, 0.05)
     corner = np.vstack([np.stack([along, 0 * along], -1), np.stack([0 * along, along + 0.05], -1), [[5.0, 5.0]]])
-    lines = estimate_normals(corner, make_tree(corner), 0.2)
+    lines = lines_of(corner, 0.2)
     assert lines.linearity[10] > 0.999
     assert lines.linearity[0] < 0.8
     assert lines.linearity[-1] == 0.0
@@ -122,7 +138,7 @@ def test_variance_of_normals_is_what_the_scatter_makes_it():
     angles, predicted = [], []
     for _ in range(400):
         wall = np.stack([np.arange(-0.3, 0.301, 0.05), rng.normal(0.0, 0.01, 13)], axis=-1)
-        lines = estimate_normals(wall, make_tree(wall), 0.21)
+        lines = lines_of(wall, 0.21)
         angles.append(np.arctan2(lines.normals[6, 0], abs(lines.normals[6, 1])))
         predicted.append(lines.normal_variance[6])
     # 400 draws know a variance to about 7 %.

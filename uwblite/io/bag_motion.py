@@ -2,7 +2,6 @@
 
 from array import array
 from collections.abc import Iterable, Sequence
-from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Floats
 from ..errors import ConfigError
 from ..sensor_log import Odometry
+from .bag_topics import did_you_mean
 
 _OTHER_CLOCK = 5.0
 """s; messages are recorded sooner after they were made."""
@@ -112,11 +112,6 @@ class Frames:
 def planar(pose: Floats) -> tuple[Floats, bool]:
     """Return x, y, theta (3,) of a pose (4, 4), and whether its z axis points down (mounted upside down)."""
     return np.array([pose[0, 3], pose[1, 3], np.arctan2(pose[1, 0], pose[0, 0])]), bool(pose[2, 2] < 0)
-
-
-def did_you_mean(name: str, names: Sequence[str]) -> str:
-    """Return a question for the name that is nearest to a wrong one, '' where none is near."""
-    return "".join(f"did you mean {near}? " for near in get_close_matches(name, names, n=1))
 
 
 _LEAST_NORM, _MOST_NORM = 1e-6, 1e6

@@ -13,7 +13,6 @@ import numpy as np
 
 from ..errors import ConfigError
 from ..sensor_log import LONGEST_RANGE
-from .bag_motion import did_you_mean
 from .uwb_mapping import KNOWN, MissingField, UwbMapping, fitting, readings_of, short_type
 
 ODOMETRY, SCAN, TRANSFORMS = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan", "tf2_msgs/msg/TFMessage"
@@ -166,6 +165,11 @@ def _topic(topics: Sequence[BagTopic], name: str) -> BagTopic:
         names = [t.name for t in topics]
         raise ConfigError(f"the bag has no topic {name}; {did_you_mean(name, names)}it has {', '.join(names)}")
     return topic
+
+
+def did_you_mean(name: str, names: Sequence[str]) -> str:
+    """Return a question for the name that is nearest to a wrong one, '' where none is near."""
+    return "".join(f"did you mean {near}? " for near in get_close_matches(name, names, n=1))
 
 
 def _check_mappings(topics: Sequence[BagTopic], mappings: Sequence[UwbMapping]) -> None:

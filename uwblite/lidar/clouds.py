@@ -16,7 +16,7 @@ from ..arrays import Bools, Floats, Ints, concatenated, dots, numbered
 from ..config import setting
 from ..graph.work import Work
 from ..odometry.attached import ScanPoints
-from .point_cloud import Lines, cell_number, estimate_normals, make_tree, mean_by_key
+from .point_cloud import Lines, cell_number, estimate_normals, mean_by_key, neighbour_pairs
 
 _TURN = 8.0
 """rad; more than all bearings differ by."""
@@ -129,15 +129,13 @@ def facing(normals: Floats, way: Floats) -> Floats:
 
 
 def _lines(owner: Ints, points: Floats, config: CloudConfig) -> Lines:
-    """Fit lines to all neighbourhoods; a block of clouds shares one tree, in which they lie side by side."""
+    """Fit lines to all neighbourhoods, of a block of clouds at a time."""
     parts = []
     blocks = np.searchsorted(owner, np.arange(0, owner.max(initial=0) + 1 + CLOUDS_AT_ONCE, CLOUDS_AT_ONCE))
-    width = points[:, 0].max(initial=0.0) - points[:, 0].min(initial=0.0)
     for first, last in pairwise(blocks):
         block = points[first:last]
-        apart = block.copy()
-        apart[:, 0] += owner[first:last] * (width + 2.0 * config.normal_radius)
-        parts.append(estimate_normals(block, make_tree(apart), config.normal_radius, config.min_neighbours))
+        pairs = neighbour_pairs(owner[first:last], block, config.normal_radius)
+        parts.append(estimate_normals(block, *pairs, config.min_neighbours))
     return concatenated(parts)
 
 

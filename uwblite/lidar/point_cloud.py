@@ -4,16 +4,35 @@ Points are finite, in metres, in any one frame, and keep their order.
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
-from ..arrays import WIDE, Bools, Floats, Ints, Table, Wides, as_array, require_finite, require_shape, run_starts, stable_order
+from ..arrays import (
+    WIDE,
+    Bools,
+    Floats,
+    Ints,
+    Table,
+    Wides,
+    as_array,
+    dots,
+    numbered,
+    require_finite,
+    require_shape,
+    run_starts,
+    stable_order,
+)
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 
-def make_tree(points: Floats) -> cKDTree:
+def make_tree(points: Floats) -> "cKDTree":
     """Return a kd-tree of points (n, 2) with the quick build: sliding midpoint splits, loose boxes."""
+    from scipy.spatial import cKDTree  # a quarter of a second, which a check of a recording does without
+
     return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
@@ -76,6 +95,29 @@ def mean_by_key(key: Wides, values: Floats) -> tuple[Ints, Floats]:
     return order[first], np.add.reduceat(values.take(order, axis=0), first, axis=0) / count
 
 
+def neighbour_pairs(owner: Ints, points: Floats, radius: float) -> tuple[Ints, Ints]:
+    """Return the pairs (p,), (p,) of points (n, 2) of one owner (n,) that are within a radius, m, of each other, each once.
+
+    With squares as wide as the radius, both points are in one square or in two that touch. Squares are numbered column by
+    column, an empty one behind each column and an empty column behind each owner, so that those that touch one are three runs.
+    """
+    x, y = np.floor(np.ascontiguousarray(points.T) / radius).astype(WIDE)
+    x -= x.min(initial=0)
+    y -= y.min(initial=0)
+    high = y.max(initial=0) + 2
+    square = (owner * (x.max(initial=0) + 2) + x) * high + y
+    order = stable_order(square)
+    square = square[order]
+    # What follows in the same square or lies in the next one of its column, then the three squares of the next column.
+    first = np.concatenate([np.arange(1, len(order) + 1), np.searchsorted(square, square + high - 1)])
+    end = np.searchsorted(square, np.concatenate([square + 1, square + high + 1]), "right")
+    run, place = numbered(end - first)
+    i, j = order[run % max(len(order), 1)], order[first[run] + place]
+    apart = points.take(j, axis=0) - points.take(i, axis=0)
+    near = dots(apart, apart) <= radius * radius
+    return i[near], j[near]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Lines(Table):
     """The straight line fitted to the surroundings of each point."""
@@ -98,7 +140,7 @@ _ROUNDING = 1e-12
 """Share of the scatter of a neighbourhood below which it is rounding error of differences of sums."""
 
 
-def estimate_normals(points: Floats, tree: cKDTree, radius: float, min_neighbours: int = 2) -> Lines:
+def estimate_normals(points: Floats, i: Ints, j: Ints, min_neighbours: int = 2) -> Lines:
     """Fit a line to the neighbours of every point: principal axes of the 2x2 covariance, in closed form.
 
     With the covariance [[a, b], [b, c]] the line's direction is atan2(2 b, a - c) / 2 and the eigenvalues are
@@ -107,10 +149,9 @@ def estimate_normals(points: Floats, tree: cKDTree, radius: float, min_neighbour
 
     Parameters
     ----------
-    points : (n, 2), m, and their tree. radius : of the neighbourhood, m. min_neighbours : others that it needs to give a line.
+    points : (n, 2), m. i, j : (p,) pairs of them that are neighbours. min_neighbours : others that it needs to give a line.
     """
     n = len(points)
-    i, j = np.ascontiguousarray(tree.query_pairs(radius, output_type="ndarray").T)
     dx, dy = (column.take(j) - column.take(i) for column in np.ascontiguousarray(points.T))
     both = np.bincount(i, minlength=n) + np.bincount(j, minlength=n)
     count = both + 1.0

@@ -11,11 +11,10 @@ cent of such points, within one visit to a place as between two; if it is wrong,
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.spatial import cKDTree
 
 from .. import se2
 from ..arrays import WIDE, Bools, Floats, Ints, Wides, chunks, evenly
@@ -23,6 +22,9 @@ from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .scan_matching import CloudPairs, Correspondences, correspondences, pairs_of
 from .submaps import Submaps
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 
 class OverlapPolicy:
@@ -211,6 +213,8 @@ def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording:
 
 def _together(poses: Floats, path: Floats, recording: Ints, again: bool) -> tuple[Ints, Ints]:
     """Return pairs (p,), (p,) of keyframes at one place: the nearest of different visits, or the farthest of one visit."""
+    from scipy.spatial import cKDTree  # a quarter of a second, which a check of a recording does without
+
     c = VisibilityPolicy
     nearest = range(1, min(c.neighbours, len(poses)) + 1)
     distance, other = cKDTree(poses[:, :2]).query(poses[:, :2], k=nearest, distance_upper_bound=c.revisit)
@@ -289,8 +293,10 @@ def _in_view(clouds: Clouds, free: Sequence[FreeSpace], i: Ints, T_i_j: Floats, 
     return np.array([seen_beyond(free[k], p)[1] > 0 for k, p in zip(i.tolist(), points, strict=True)], dtype=bool)
 
 
-def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
+def surface_cells(clouds: Clouds, poses: Floats) -> "sparse.csr_matrix":
     """Return which surface cells (columns) each cloud (rows) sees; a cell is a square of the map and one of some facings."""
+    from scipy import sparse  # a fifth of a second, which a check of a recording does without
+
     usable, many = np.flatnonzero(clouds.lines), OverlapPolicy.facings
     cell, facing = np.empty((len(usable), 2), dtype=np.int32), np.empty(len(usable), dtype=np.int8)
     for part in chunks(len(usable)):

@@ -248,7 +248,8 @@ def _free_side(geometry: GridGeometry, states: NDArray[np.int8], points: Floats)
 def _lines(points: Floats, sides: Floats, resolution: float) -> Lines:
     """Fit a line to each cell's neighbours on its own side of the wall, a thin one having two surfaces; resolution in m."""
     radius = max(_NORMAL_RADIUS, _LEAST_CELLS * resolution)
-    lines = estimate_normals(points, make_tree(np.column_stack([points, radius * sides])), radius)
+    pairs = make_tree(np.column_stack([points, radius * sides])).query_pairs(radius, output_type="ndarray")
+    lines = estimate_normals(points, *np.ascontiguousarray(pairs.T))
     straight = lines.linearity >= _STRAIGHT
     normals = np.where(straight[:, None], lines.normals, 0.0)
     centers = np.where(straight[:, None], lines.centers, points)

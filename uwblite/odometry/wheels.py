@@ -10,7 +10,6 @@ from ..arrays import BEYOND_NOISE, MAD_TO_SIGMA, MOST, TINY, Bools, Floats, Ints
 from ..config import setting
 from ..graph.calibration import CalibrationConfig, odometry_indices
 from ..graph.graph import Calibration, Graph, edge_weights
-from ..graph.marginals import added_unknown
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..graph.robust import Kernel
 from ..sensor_log import Odometry
@@ -223,6 +222,8 @@ def redundancy(graph: Graph, wheels: OdometryEdges, sound: Floats) -> Floats:
     It is the trace of a matrix as large as there are steps, estimated by vectors of unrelated signs, those of chirps (M.
     Hutchinson, A stochastic estimator of the trace, 1989).
     """
+    from ..graph.marginals import added_unknown  # loads scipy, which a check of a recording does without
+
     phase = np.outer(np.arange(1, _PROBES + 1), np.arange(len(wheels)) ** 2) * _GOLDEN
     directions = wheels.motion.shape[1]
     shifts = np.einsum("ke,e,cd->cked", np.where(phase % 1.0 < 0.5, -1.0, 1.0), np.sqrt(sound), np.eye(directions))

@@ -14,7 +14,6 @@ import numpy as np
 
 from ..arrays import Floats
 from ..graph.graph import Graph, PriorEdges
-from ..graph.marginals import calibration_covariance
 
 
 def laplace_marginal_likelihood(graph: Graph) -> float:
@@ -28,6 +27,8 @@ def laplace_marginal_likelihood(graph: Graph) -> float:
     ------
     SolverError : the measurements do not determine the graph.
     """
+    from ..graph.marginals import calibration_covariance  # loads scipy, which a check of a recording does without
+
     which = np.flatnonzero(~graph.fixed_calibration)
     determinant = np.linalg.slogdet(calibration_covariance(graph)[np.ix_(which, which)])[1]
     return float(0.5 * (determinant - graph.chi2()) - np.sum(np.log(prior_sigma(graph)[which])))
