@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Floats, Ints
+from ..arrays import CHUNK, Floats, Ints, chunks
 from ..sensor_log import MOST_METRES, UwbRanges
 
 
@@ -105,11 +105,13 @@ def clean(ranges: NDArray[np.float32], range_min: float, range_max: float, *, ze
     ----------
     zero_is_nothing : a 0 is no echo, as drivers of ROS older than REP-117 write it.
     """
-    with np.errstate(invalid="ignore"):
-        nothing = ranges >= np.float32(range_max)
-        nothing |= zero_is_nothing & (ranges == 0.0)
-        ranges[~(ranges >= np.float32(range_min))] = np.nan
-    ranges[nothing] = np.inf
+    for rows in chunks(len(ranges), max(CHUNK // ranges.shape[1], 1)):
+        some = ranges[rows]
+        with np.errstate(invalid="ignore"):
+            nothing = some >= np.float32(range_max)
+            nothing |= zero_is_nothing & (some == 0.0)
+            np.putmask(some, ~(some >= np.float32(range_min)), np.nan)
+        np.putmask(some, nothing, np.inf)
 
 
 def reach_of(ranges: NDArray[np.float32], warnings: list[str]) -> float:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ENOUGH, MOST, Bools, Floats, Ints, evenly, runs_of, white_noise
+from ..arrays import ENOUGH, MAD_TO_SIGMA, MOST, Bools, Floats, Ints, bends, evenly, row_medians, runs_of
 from ..findings import Fact
 from ..sensor_log import LaserScans, SensorLog
 
@@ -135,10 +135,10 @@ def quiet_noise(each: list[Floats], resolution: float) -> float:
     ----------
     each : ranges of each anchor (m,), m. resolution : m; rounding looks like noise of up to 0.6 times as much.
     """
-    size, found = RepeatPolicy.in_row, list[float]()
-    for values in each:
-        parts = values[: len(values) // size * size].reshape(-1, size)
-        found += [white_noise(part) for part in parts if np.ptp(part) > max(RepeatPolicy.changes, 4.0 * resolution)]
+    size = RepeatPolicy.in_row
+    parts = np.concatenate([values[: len(values) // size * size].reshape(-1, size) for values in each])
+    parts = parts[np.ptp(parts, axis=1) > max(RepeatPolicy.changes, 4.0 * resolution)]
+    found = MAD_TO_SIGMA * row_medians(np.abs(bends(parts.T).T))
     if 2 * len(found) < size:
         return RepeatPolicy.usual_noise
     # A quarter of them are in line of sight.
