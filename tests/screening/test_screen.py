@@ -55,9 +55,11 @@ def test_wheels_that_stand_still_are_replaced_by_the_motion_from_scan_to_scan(so
         for x in (done, sound, log)
     )
     assert np.hypot(*(lost - true)[:2]) > 0.5 or abs(se2.wrap_angle(lost[2] - true[2])) > 1.0
+    # 120 steps of 0.02 m and 0.01 rad, as single scans have; only the scans, which are matched again, state what they measure.
+    assert np.hypot(*(motion - true)[:2]) < 0.44
+    assert abs(se2.wrap_angle(motion[2] - true[2])) < 0.22
     spread = np.sqrt((done.screening.breaks.sigma**2).sum(axis=0))
-    assert np.hypot(*(motion - true)[:2]) < 2.0 * spread[0] < 0.5
-    assert abs(se2.wrap_angle(motion[2] - true[2])) < 2.0 * spread[2]
+    assert np.all(spread > [1.0, 1.0, 1.0])
 
 
 def test_without_lidar_ranges_show_that_wheels_stand_still_and_the_map_is_doubted(sound):

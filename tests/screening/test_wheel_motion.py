@@ -157,7 +157,6 @@ def test_only_pairs_within_a_time_that_match_measure_it():
     found = pairs(10, share=share)
     assert np.flatnonzero(found.within(2.0, 6.5)).tolist() == [2, 3, 5, 6]
     assert np.flatnonzero(found.within(2.1, 6.4)).tolist() == [3, 5]
-    assert (found.seen(2.0, 5.5), found.seen(2.1, 5.5)) == (True, False)
 
 
 def test_the_way_ratio_is_of_measured_pairs_with_a_clear_way():
@@ -198,24 +197,22 @@ def test_scans_do_not_match_where_one_pair_in_ten_does_not_either(share, said):
 @pytest.mark.parametrize(
     ("off", "said"),
     [
-        # 0.05 m and 0.35 of the larger of both ways: of 0.1 m against 0.23 m 0.1305 m; 0.06 rad and 0.35 of the larger turn.
-        ((0.129, 0.0, 0.0), False), ((0.135, 0.0, 0.0), True), ((-0.084, 0.0, 0.0), False), ((-0.086, 0.0, 0.0), True),
-        ((0.0, 0.091, 0.0), False), ((0.0, 0.1, 0.0), True), ((0.0, 0.0, 0.092), False), ((0.0, 0.0, -0.093), True),
+        ((0.05, 0.0, 0.0), False), ((0.2, 0.0, 0.0), True), ((-0.05, 0.0, 0.0), False), ((-0.2, 0.0, 0.0), True),
+        ((0.0, 0.05, 0.0), False), ((0.0, 0.2, 0.0), True), ((0.0, 0.0, 0.02), False), ((0.0, 0.0, -0.08), True),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("factor", [1.0, 0.8])
 def test_a_motion_that_noise_does_not_explain_for_long_is_said(off, said, factor):
-    """Of ten pairs in a row, a second apart; the one factor between all ways is taken out before."""
+    """Of twenty pairs in a row, a second apart; the one factor between all ways is taken out before."""
     found = pairs(wheels=pairs().wheels / [factor, 1.0, 1.0])
-    found.lidar[40:50] += off
+    found.lidar[40:60] += off
     if not said:
         assert disagreeing(found, 0.0) == []
         return
     (remark,) = told(disagreeing(found, 10.0))
     assert remark.severity == "doubt"
     first, last = (int(word) for word in (remark.text.split("t = ")[1].split()[0], remark.text.split(" to ")[1].split()[0]))
-    assert abs(first - 30) <= 2
-    assert abs(last - 40) <= 2
+    assert (first, last) == (30, 50)
 
 
 @pytest.mark.parametrize(("until", "share", "severity"), [(80, 0.4, "warning"), (100, 0.4, "doubt"), (80, 0.0, "doubt")])
@@ -227,14 +224,11 @@ def test_wheels_that_count_too_much_for_a_while_slip(until, share, severity):
     assert (remark.kind, remark.severity) == ("wheels-against-lidar", severity)
 
 
-@pytest.mark.parametrize(("count", "said"), [(4, False), (9, True)])
-def test_a_disagreement_lasts_six_seconds_and_pairs_that_do_not_match_say_nothing(count, said):
+@pytest.mark.parametrize(("count", "said"), [(8, False), (12, True)])
+def test_a_disagreement_lasts_longer_than_a_slip_and_pairs_that_do_not_match_say_nothing(count, said):
     found = pairs()
     found.lidar[40 : 40 + count, 1] = 0.5
     assert len(disagreeing(found, 0.0)) == said
-    quick = pairs(start=0.5 * np.arange(100.0), end=0.5 * np.arange(100.0) + 0.2)
-    quick.lidar[40 : 40 + count, 1] = 0.5
-    assert disagreeing(quick, 0.0) == []
     found.share[40 : 40 + count] = 0.5
     assert disagreeing(found, 0.0) == []
     few = pairs(23)
@@ -315,6 +309,32 @@ def test_a_robot_at_rest_whose_scans_differ_by_noise_stands():
         if not found:
             compared.lidar[own] += [0.04, 0.0, 0.0]
         assert wheel_motion.lost(log, compared) == [pytest.approx(stretch, abs=0.5) for stretch in found]
+
+
+@pytest.mark.parametrize(("walls", "shown"), [(CORRIDOR, False), (box(16.0, 5.0), True)])
+def test_scans_along_a_smooth_wall_do_not_show_that_a_robot_stands(walls, shown):
+    """They match as well if it drove on; in a room they do not."""
+    stamps = 0.1 * np.arange(300)
+    odometry = driven(np.where((stamps > 10.0) & (stamps < 20.0), 0.0, 0.2), 0.0 * stamps)
+    seen = scans(stamps, odometry.poses[:-1] - [6.0, 0.0, 0.0], walls, noise=0.01, rng=np.random.default_rng(1))
+    log = SensorLog(odometry, None, seen)
+    found = compare(log)
+    assert found.measured[found.within(10.0, 20.0)].sum() > 10
+    assert wheel_motion.show_rest(log, found, 10.0, 20.0) == shown
+    assert not wheel_motion.show_rest(log, found, 18.0, 18.1)
+
+
+def test_wheels_that_count_nothing_any_more_are_related_to_the_lidar_as_long_as_they_count():
+    """From half time on the lidar drives and turns alone."""
+    rng = np.random.default_rng(2)
+    found = pairs(200)
+    found.lidar[:, 2] = found.wheels[:, 2] = np.where(np.arange(200) % 2, 0.1 * rng.choice([-1.0, 1.0], 200), 0.0)
+    found.wheels[100:] = 0.0
+    assert not found.unrelated
+    (fact,) = disagreeing(found, 0.0)
+    assert fact.figures["stretches"] == [pytest.approx((100.0, 199.5), abs=1.5)]
+    found.wheels[:100] = found.wheels[:100][rng.permutation(100)]
+    assert found.unrelated
 
 
 def test_a_pair_matches_clearly_worse_at_twice_the_square_of_another_that_noise_allows():
@@ -399,8 +419,10 @@ def test_the_motion_of_scans_stands_in_and_the_rest_moves_along(period):
     assert len(breaks.stamps) == pytest.approx(10.0 / apart, abs=2)
     assert STILL[0] - 0.25 - period <= breaks.stamps[0] <= STILL[0] + apart
     assert np.all(np.diff(breaks.stamps) > 0.0)
-    np.testing.assert_allclose(breaks.sigma[[5, 6]], 0.3)
-    np.testing.assert_allclose(np.delete(breaks.sigma, [5, 6], axis=0), [[0.02, 0.02, 0.01]] * (len(breaks.stamps) - 2))
+    # Nothing counts there: 0.3 m/s in any direction for 2 s at a time, so that scans and ranges alone decide.
+    speed = np.hypot(*(truth[1, :2] - truth[0, :2])) / (log.odometry.stamps[1] - log.odometry.stamps[0])
+    walk = np.sqrt(apart / 2.0) * np.array([2.0 * speed, 2.0 * speed, 0.5])
+    np.testing.assert_allclose(breaks.sigma[1:-1], np.tile(walk, (len(breaks.stamps) - 2, 1)), rtol=0.02)
 
 
 @pytest.mark.usefixtures("exact_scans")
@@ -436,11 +458,10 @@ def test_steps_that_scans_do_not_show_go_on_as_before_and_after(monkeypatch):
 
     monkeypatch.setattr(wheel_motion, "scan_steps", steps)
     log, _ = log_of()
-    found, matched = _smooth_steps(log, np.arange(13))
+    found = _smooth_steps(log, np.arange(13))
     np.testing.assert_array_equal(guesses[0], 0.0)
     np.testing.assert_allclose(guesses[1], usual)
     expected = other.copy()
     expected[[3, 6]] = usual[[3, 6]]
     expected[8] = one[8]
     np.testing.assert_allclose(found, expected)
-    assert np.flatnonzero(~matched).tolist() == [3, 6]

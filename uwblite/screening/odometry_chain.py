@@ -27,6 +27,8 @@ _GLITCH_SECONDS = 1.0
 """A chain that is continuous again after so long was interrupted by wrong readings, s."""
 _INTERLEAVED = 0.05
 """Share of jumping steps from which on two sources were written into one log."""
+SAME_MOTION = 2.0
+"""Time for which a robot drives as it does, s."""
 _NEIGHBOURS = 6
 """Steps on either side of a break by which the motion across it is predicted."""
 
@@ -61,9 +63,13 @@ class Motion:
         return np.asarray(np.any(self.sizes > _LEAST_JUMP + self.speed * time[:, None], axis=1))
 
 
-def usual_speed(odometry: Odometry) -> float:
-    """Return the usual speed of a robot that drives, m/s."""
-    return float(Motion.of(odometry).speed[0]) / _TIMES_USUAL
+def unmeasured(odometry: Odometry, seconds: Floats) -> Floats:
+    """Return the standard deviations (b, 3) of steps of so many seconds (b,) that no wheel counts, m, m, rad.
+
+    The robot may drive at its usual speed in any direction, and in another one after a while: such steps are a random walk.
+    """
+    way = float(Motion.of(odometry).speed[0]) / _TIMES_USUAL * SAME_MOTION
+    return np.sqrt(seconds / SAME_MOTION)[:, None] * np.array([way, way, 0.5])
 
 
 def without_glitches(odometry: Odometry) -> tuple[Odometry, list[Fact]]:

@@ -8,13 +8,12 @@ from ..findings import Fact
 from ..odometry.gyro import heading_from_gyro
 from ..sensor_log import Odometry, OdometryBreaks, Screening, SensorLog
 from . import clocks, cuts, directions, odometry_chain, range_motion, repeats, units, wheel_motion
+from .odometry_chain import SAME_MOTION, unmeasured
 from .range_explanations import explained_by_ranges
 from .wheel_motion import Pairs
 
 _SHORTEST_PATH = 2.0
 """A shorter path is not enough for the tests, m."""
-_STEP = 2.0
-"""Time between the steps of lost wheels, where no lidar replaces them, s."""
 _LONG_STAND = 5.0
 """Least time without motion of the wheels, s, that is tested with ranges where there is no lidar."""
 
@@ -91,9 +90,10 @@ def _hardly_moving(odometry: Odometry) -> list[Fact]:
 def _lost_wheels(log: SensorLog, pairs: Pairs | None) -> tuple[SensorLog, Pairs | None, OdometryBreaks, list[Fact]]:
     """Find stretches in which the wheels stand and other sensors move, and replace the wheels there."""
     start = float(log.odometry.stamps[0])
-    unseen = [s for s in wheel_motion.standing(log.odometry, _LONG_STAND) if pairs is None or not pairs.seen(*s)]
-    unseen = [(a, b) for a, b in unseen if range_motion.excess(log, a, b) > 0.0]
     stretches = [] if pairs is None else wheel_motion.lost(log, pairs)
+    unseen = [s for s in wheel_motion.standing(log.odometry, _LONG_STAND) if s not in stretches]
+    unseen = [s for s in unseen if pairs is None or not wheel_motion.show_rest(log, pairs, *s)]
+    unseen = [(a, b) for a, b in unseen if range_motion.excess(log, a, b) > 0.0]
     facts = [
         Fact.of("wheels-stand-still", begin=a - start, end=b - start, by_scans=by_scans)
         for by_scans, found in ((False, unseen), (True, stretches))
@@ -108,8 +108,7 @@ def _lost_wheels(log: SensorLog, pairs: Pairs | None) -> tuple[SensorLog, Pairs 
 
 
 def _unknown_steps(odometry: Odometry, stretches: list[tuple[float, float]]) -> OdometryBreaks:
-    """Return steps every few seconds with the uncertainty of a robot that may have driven at usual speed in any direction."""
-    way = odometry_chain.usual_speed(odometry) * _STEP
-    at = np.concatenate([np.zeros(0), *(np.arange(a + 0.5 * _STEP, b, _STEP) for a, b in stretches)])
+    """Return steps every few seconds in stretches in which nothing but ranges shows where the robot drove."""
+    at = np.concatenate([np.zeros(0), *(np.arange(a + 0.5 * SAME_MOTION, b, SAME_MOTION) for a, b in stretches)])
     before = np.clip(np.searchsorted(odometry.stamps, at) - 1, 0, max(len(odometry.stamps) - 2, 0))
-    return OdometryBreaks(odometry.stamps[before], np.tile([way, way, 0.5], (len(at), 1)))
+    return OdometryBreaks(odometry.stamps[before], unmeasured(odometry, np.full(len(at), SAME_MOTION)))

@@ -1,11 +1,13 @@
 """Comparison of the motion by wheels and by lidar, stretch by stretch.
 
 Pairs of scans a short time apart, spread over the recording, are matched and compared with the odometry of the same time.
-One factor for all distances and one for all turns are calibration, and removed before. A remaining difference over a stretch is
-a fault: wheels that count nothing while the scans move are replaced there by the motion from scan to scan; wheels that count
-too much for a while slip, and are named; any other lasting difference is a doubt.
+One factor for all distances and one for all turns are calibration, and removed before. Two explanations of what the lidar
+measures over a pair compete: the motion by the wheels, or that of any other time. A stretch with very strong evidence for the
+second is a fault: wheels that count too much for a while slip, and are named; any other is a doubt. Wheels that count nothing
+while the scans move are replaced there by the motion from scan to scan.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +16,9 @@ from .. import se2
 from ..arrays import ENOUGH, MOST, Bools, Floats, Ints, Table, runs_of
 from ..findings import Fact
 from ..lidar.scan_odometry import directional_shares, misfits, scan_steps
+from ..problem.alternatives import EvidencePolicy
 from ..sensor_log import LaserScans, Odometry, OdometryBreaks, SensorLog
+from .odometry_chain import unmeasured
 
 
 class PairPolicy:
@@ -50,25 +54,25 @@ class PairPolicy:
     """Motion between the scans of a pair that is larger than noise, m and rad."""
     clear: float = 0.05
     """Distance that is large enough for a ratio and a direction, m."""
-    related: float = 0.5
-    """Correlation of the motions by two sensors that both work, at least."""
+    slips: float = 0.4
+    """Probability that wheels which work measure no motion over a pair, for they slip."""
     enough: int = 12
     """Pairs whose median is a figure."""
     lasting: int = 6
-    """Pairs in a row, and seconds, of a lasting difference; half as many show whether the robot moves."""
-    allowed: tuple[float, float] = (0.05, 0.06)
-    relative: float = 0.35
-    """Difference, m and rad, and share of the larger motion, that noise of single scans explains."""
+    """Steps from scan to scan over which motion is steady; half as many pairs show whether the robot moves."""
+    errors: tuple[float, float] = (0.05, 0.02)
+    """Differences between wheels and lidar over a pair, m and rad, that a slight slip and noise of single scans explain."""
+    wheels: float = 1e-2
+    """Probability that wheels do not measure the motion."""
     replaced: float = 0.25
     """Time between the scans whose motion replaces the wheels, s."""
-    step_sigma: tuple[float, float, float] = (0.02, 0.02, 0.01)
-    unknown_sigma: float = 0.3
-    """Standard deviations of such a step, m, m, rad, and of one where scans do not match either, m and rad."""
     searches: int = 100
     """Steps of a stretch that are searched for, where they match badly."""
 
 
 _NAN = float("nan")
+_PARTS = slice(0, 2), slice(2, None)
+"""Ways and turns of motions."""
 
 
 def times_as_large(others: Floats, motions: Floats, clear: float) -> float:
@@ -81,26 +85,48 @@ def times_as_large(others: Floats, motions: Floats, clear: float) -> float:
 
 
 def lidar_by_wheels(wheels: Floats, lidar: Floats, clear: float, otherwise: float) -> float:
-    """Return how many times as large as the wheels' motions (e, d) the lidar's are; `otherwise` where too few are clear, or
-    the two have nothing in common.
+    """Return how many times as large as the wheels' motions (e, d) the lidar's are.
+
+    It is `otherwise` where too few are clear, or most are opposite.
 
     Noise of one sensor, such as rounding, draws the ratio to its own motions down (regression dilution). So the ratio to the
     other's motions is taken as well, and of both the one that is nearer to 1.
     """
-    if unrelated(wheels, lidar, clear):
-        return otherwise
     ratio, inverse = times_as_large(lidar, wheels, clear), times_as_large(wheels, lidar, clear)
     if not (ratio > 0.0 and inverse > 0.0):
-        return otherwise if np.isnan(ratio) else ratio
+        return ratio if ratio > 0.0 else otherwise
     return min(ratio, 1.0 / inverse, key=lambda value: abs(np.log(value)))
 
 
-def unrelated(wheels: Floats, lidar: Floats, clear: float) -> bool:
-    """Return whether clear motions by wheels and by lidar (e, d) have nothing in common.
+def _of_another_time(lidar: Floats, wheels: Floats) -> Floats:
+    """Return the log odds (e,) of motions by the lidar (e, 3) being those of any other pair, not those by the wheels (e, 3).
 
-    The product of the slopes of the one by the other and of the other by the one is their correlation, squared.
+    Errors have Cauchy's distribution, and wheels that slip may have moved as at another time as well.
     """
-    return 0.0 <= times_as_large(lidar, wheels, clear) * times_as_large(wheels, lidar, clear) < PairPolicy.related**2
+    others, own = np.zeros((len(lidar), len(lidar))), np.zeros(len(lidar))
+    for part, error in zip(_PARTS, PairPolicy.errors, strict=True):
+        power, one = -0.5 * (1.0 + lidar[:, part].shape[1]), lidar[:, part] / error
+        others += power * np.log1p(np.sum((one[:, None] - one) ** 2, axis=2))
+        own += power * np.log1p(np.sum((one - wheels[:, part] / error) ** 2, axis=1))
+    np.fill_diagonal(others, -np.inf)
+    another = np.logaddexp.reduce(others, axis=1) - math.log(max(len(lidar) - 1, 1))
+    return np.asarray(another - np.logaddexp(math.log(1.0 - PairPolicy.slips) + own, math.log(PairPolicy.slips) + another))
+
+
+def _likely_runs(log_odds: Floats) -> list[tuple[int, int]]:
+    """Return the runs (first, end) of pairs for which there is very strong evidence, given the log odds (e,) of each.
+
+    The likeliest of all sequences of runs is sought (A. Viterbi, 1967); each run has the prior odds of wheels that fail.
+    """
+    prior, total = math.log(PairPolicy.wheels), np.concatenate([[0.0], np.cumsum(log_odds)])
+    sound: tuple[float, tuple[int, ...]] = (0.0, ())
+    within: tuple[float, tuple[int, ...]] = (-math.inf, ())
+    for k, gain in enumerate(log_odds.tolist()):
+        score, edges = max(within, (sound[0] + prior, (*sound[1], k)))
+        within = (score + gain, edges)
+        sound = max(sound, (within[0], (*edges, k + 1)))
+    runs = zip(sound[1][::2], sound[1][1::2], strict=True)
+    return [(a, b) for a, b in runs if total[b] - total[a] + prior > EvidencePolicy.very_strong]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,21 +153,24 @@ class Pairs(Table):
         """Return which pairs (e,) measure a motion between two times, s."""
         return self.measured & (self.start >= start) & (self.end <= end)
 
-    def seen(self, start: float, end: float) -> bool:
-        """Return whether scans show if the robot moves between two times, s."""
-        return 2 * int(self.within(start, end).sum()) >= PairPolicy.lasting
-
     @property
     def unrelated(self) -> bool:
-        """Whether the ways by lidar and wheels have nothing in common."""
-        own = self.rows(self.measured)
-        return unrelated(own.wheels[:, :2], own.lidar[:, :2], PairPolicy.clear)
+        """Whether motions by the lidar are none of the wheels' wherever these count."""
+        counts = np.any(np.abs(self.wheels) > PairPolicy.errors[0], axis=1)
+        own = self.rows(self.measured & counts)
+        return sum(end - first for first, end in _likely_runs(_of_another_time(own.lidar, own.scaled))) > MOST * len(own.start)
+
+    @property
+    def scaled(self) -> Floats:
+        """(e, 3) motion by wheels, one factor for all ways and one for all turns taken out."""
+        factors = [lidar_by_wheels(self.wheels[:, p], self.lidar[:, p], PairPolicy.moving, 1.0) for p in _PARTS]
+        return self.wheels * np.repeat(factors, [2, 1])
 
     @property
     def way_ratio(self) -> float:
         """The way by the lidar / the way by the wheels; nan where there are too few clear motions."""
         own = self.rows(self.measured)
-        return lidar_by_wheels(own.wheels[:, :2], own.lidar[:, :2], PairPolicy.clear, _NAN)
+        return _NAN if self.unrelated else lidar_by_wheels(own.wheels[:, :2], own.lidar[:, :2], PairPolicy.clear, _NAN)
 
 
 def standing(odometry: Odometry, least: float = PairPolicy.least_stand) -> list[tuple[float, float]]:
@@ -239,23 +268,35 @@ def _span(odometry: Odometry) -> float:
 
 
 def lost(log: SensorLog, pairs: Pairs) -> list[tuple[float, float]]:
-    """Return the stretches in which the wheels stand and the scans move, and match clearly worse if the robot stood.
+    """Return the stretches in which the wheels stand and scans show that the robot does not.
 
-    Scans that show other motions than the wheels wherever these drive do not show that they fail where they stand.
+    While a robot rests, one pair of scans in ten at most matches clearly better at some motion, as where somebody walks by;
+    while its wheels count nothing any share of them may. Scans that show other motions than the wheels wherever these drive
+    do not show that they fail where they stand.
     """
     if pairs.unrelated:
         return []
-    moving = (np.hypot(*pairs.lidar[:, :2].T) > PairPolicy.moving) | (np.abs(pairs.lidar[:, 2]) > PairPolicy.moving)
     found = []
     for a, b in standing(log.odometry):
-        own = pairs.within(a, b)
-        if not pairs.seen(a, b) or np.mean(moving[own]) <= 0.5:
-            continue
-        moved = pairs.rows(own & moving)
-        by_lidar, at_rest = (_misfits(log, moved, motion) for motion in (moved.lidar, 0.0 * moved.lidar))
-        if np.mean(_clearly_worse(at_rest, by_lidar)) * np.mean(moving[own]) > 0.5:
+        own = pairs.rows(pairs.within(a, b))
+        by_lidar, at_rest = (_misfits(log, own, motion) for motion in (own.lidar, 0.0 * own.lidar))
+        moved = _clearly_worse(at_rest, by_lidar)
+        count, still = int(moved.sum()), int((~moved).sum())
+        any_share = math.lgamma(count + 1.0) + math.lgamma(still + 1.0) - math.lgamma(len(moved) + 2.0)
+        at_most = count * math.log(1.0 - MOST) + still * math.log(MOST)
+        if any_share + math.log(PairPolicy.wheels) - at_most > EvidencePolicy.very_strong:
             found.append((a, b))
     return found
+
+
+def show_rest(log: SensorLog, pairs: Pairs, start: float, end: float) -> bool:
+    """Return whether scans show that a robot whose wheels stand between two times, s, stands.
+
+    Along a smooth wall they match as well if it drove on.
+    """
+    own = pairs.rows(pairs.within(start, end))
+    at_rest, driven = (_misfits(log, own, np.tile([way, 0.0, 0.0], (len(own.start), 1))) for way in (0.0, PairPolicy.apart))
+    return 2 * int(_clearly_worse(driven, at_rest).sum()) >= PairPolicy.lasting
 
 
 def _misfits(log: SensorLog, pairs: Pairs, motion: Floats) -> Floats:
@@ -272,49 +313,26 @@ def disagreeing(pairs: Pairs, start: float, log: SensorLog | None = None) -> lis
     measure; such pairs show nothing, where the log with their scans is given. Wheels that spin while the robot drives count too
     much, until they grip again; late clocks give back what they take, or go on to the end, and a covered lidar stands still.
     """
-    own, lasting = pairs.rows(pairs.measured), PairPolicy.lasting
+    own = pairs.rows(pairs.measured)
     if len(own.start) < 2 * PairPolicy.enough:
         return []
     if pairs.unrelated:
         return [Fact.of("wheels-against-lidar", start=start, stretches=[], slips=False)]
-    parts = slice(0, 2), slice(2, None)
-    way, turn = (lidar_by_wheels(own.wheels[:, p], own.lidar[:, p], PairPolicy.moving, 1.0) for p in parts)
-    wheels = own.wheels * np.array([way, way, turn])
-    bad, more = np.zeros(len(own.start), dtype=bool), []
-    drives = np.any(np.abs(own.lidar) > PairPolicy.moving, axis=1)
-    for part, allowed in zip(parts, PairPolicy.allowed, strict=True):
-        differs, *sizes = (np.linalg.norm(motion[:, part], axis=1) for motion in (own.lidar - wheels, own.lidar, wheels))
-        off = differs > allowed + PairPolicy.relative * np.maximum(*sizes)
+    wheels = own.scaled
+    runs = _likely_runs(_of_another_time(own.lidar, wheels))
+    if log is not None and runs:
+        by_lidar, by_wheels = (_misfits(log, own, motion) for motion in (own.lidar, wheels))
+        shown = by_wheels > PairPolicy.worse * by_lidar
+        runs = _likely_runs(_of_another_time(np.where(shown[:, None], own.lidar, wheels), wheels))
+    drives, more = np.any(np.abs(own.lidar) > PairPolicy.moving, axis=1), []
+    for part, error in zip(_PARTS, PairPolicy.errors, strict=True):
+        differs, way = (np.linalg.norm(motion[:, part], axis=1) for motion in (own.lidar - wheels, wheels))
         along = np.sum((wheels - own.lidar)[:, part] * wheels[:, part], axis=1)
         # Of a way that a slipping wheel counts all may be missing, but no more.
-        within = (along > 0.5 * differs * sizes[1]) & (along < (sizes[1] + allowed) * sizes[1])
-        more.append(off & drives & within)
-        bad |= off
-    if log is not None and bad.any():
-        by_lidar, by_wheels = (_misfits(log, own.rows(bad), motion[bad]) for motion in (own.lidar, wheels))
-        bad[bad] = by_wheels > PairPolicy.worse * by_lidar
-    smooth = np.convolve(bad, np.ones(lasting) / lasting, mode="same") > PairPolicy.matching
-    smooth |= _turn_otherwise(own.lidar[:, 2], wheels[:, 2])
-    runs = [(a, b) for a, b in runs_of(smooth) if own.end[b - 1] - own.start[a] >= lasting]
-    slips = all(max(np.mean(of[a:b]) for of in more) > 0.5 and b + lasting // 2 < len(smooth) for a, b in runs)
+        more.append(drives & (differs > error) & (along > 0.5 * differs * way) & (along < (way + error) * way))
+    slips = all(max(np.mean(of[a:b]) for of in more) > 0.5 and b + PairPolicy.lasting // 2 < len(drives) for a, b in runs)
     stretches = [(float(own.start[a]), float(own.end[b - 1])) for a, b in runs]
     return [Fact.of("wheels-against-lidar", start=start, stretches=stretches, slips=slips)] if stretches else []
-
-
-def _turn_otherwise(lidar: Floats, wheels: Floats) -> Bools:
-    """Return which pairs (e,) are of a stretch in which nearly all clear turns (e,) differ.
-
-    Pairs of a straight way say nothing about turns. Where so many differ each may do so by less than a single one shows.
-    """
-    larger, count = np.maximum(np.abs(lidar), np.abs(wheels)), 2 * PairPolicy.enough
-    least = PairPolicy.allowed[1] * np.sqrt(PairPolicy.lasting / count) + PairPolicy.relative * larger
-    found, clear = np.zeros(len(larger), dtype=bool), np.flatnonzero(larger > PairPolicy.moving)
-    off = (np.abs(lidar - wheels) > least)[clear]
-    if len(clear) >= count:
-        for k in np.flatnonzero(np.convolve(off, np.ones(count) / count, mode="valid") >= MOST).tolist():
-            row = clear[k : k + count][off[k : k + count]]
-            found[row[0] : row[-1] + 1] = True
-    return found
 
 
 def unmatched(pairs: Pairs) -> list[Fact]:
@@ -326,7 +344,10 @@ def unmatched(pairs: Pairs) -> list[Fact]:
 
 
 def replaced(log: SensorLog, stretches: list[tuple[float, float]]) -> tuple[Odometry, OdometryBreaks]:
-    """Return the odometry with the motion from scan to scan in stretches in which the wheels were lost."""
+    """Return the odometry with the motion from scan to scan in stretches in which the wheels were lost.
+
+    Nothing but the scans, which the map matches again, measures those steps, and where these show nothing either nothing does.
+    """
     odometry, scans = log.odometry, log.scans
     assert scans is not None
     stamps, breaks, middle = odometry.stamps, [OdometryBreaks.none()], scans.middles
@@ -336,21 +357,19 @@ def replaced(log: SensorLog, stretches: list[tuple[float, float]]) -> tuple[Odom
         inside = inside[(middle[inside] >= stamps[0]) & (middle[inside] <= stamps[-1])]
         if len(inside) < 2:
             continue
-        steps, matched = _smooth_steps(log, inside)
-        at = middle[inside]
+        steps, at = _smooth_steps(log, inside), middle[inside]
         own = np.flatnonzero((stamps > at[0]) & (stamps <= at[-1]))
         moved = se2.interpolate_trajectory(at, se2.chain(np.zeros_like(steps[0]), steps), stamps[own])
         moved = se2.compose(odometry.poses[max(own[0] - 1, 0)], moved)
         rest = se2.compose(moved[-1], se2.between(odometry.poses[own[-1]], odometry.poses[own[-1] + 1 :]))
         odometry = Odometry(stamps, np.concatenate([odometry.poses[: own[0]], moved, rest]))
         before = np.clip(np.searchsorted(stamps, at[1:]) - 1, 0, len(stamps) - 1)
-        sigma = np.where(matched[:, None], PairPolicy.step_sigma, PairPolicy.unknown_sigma)
-        breaks.append(OdometryBreaks(stamps[before], sigma))
+        breaks.append(OdometryBreaks(stamps[before], unmeasured(log.odometry, np.diff(at))))
     return odometry, OdometryBreaks.of_all(breaks)
 
 
-def _smooth_steps(log: SensorLog, chosen: Ints) -> tuple[Floats, Bools]:
-    """Return the motions between chosen scans, and which of them match; the others go on as those before and after.
+def _smooth_steps(log: SensorLog, chosen: Ints) -> Floats:
+    """Return the motions between chosen scans; those that do not match go on as those before and after.
 
     They are measured twice: the second time directions that scans do not measure continue the motion before and after.
     """
@@ -364,4 +383,4 @@ def _smooth_steps(log: SensorLog, chosen: Ints) -> tuple[Floats, Bools]:
     taken = np.where((better >= share - PairPolicy.gain)[:, None], again, steps)
     # No step is longer than a metre: that is 4 m/s.
     matched = (np.maximum(share, better) >= 0.5) & (np.hypot(taken[:, 0], taken[:, 1]) <= 1.0)
-    return np.where(matched[:, None], taken, usual), matched
+    return np.where(matched[:, None], taken, usual)
