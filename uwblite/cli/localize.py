@@ -45,15 +45,15 @@ def run(args: argparse.Namespace) -> int:
     anchors = [DrawnAnchor(a.id, a.position, a.covariance) for a in earlier.anchors]
     drawn = DrawnMap(earlier.grid, [localization.trajectory], anchors)
     picture = draw_map(drawn, caption=os.path.basename(args.log)) if "picture" in files else None
-    with _together(files, args.out) as places:
+    with _appearing_together(files, args.out) as places:
         _write(places, localization, picture, json_lines(about | summary))
     console.report(args.json, summary, _lines(localization, list(files.values())))
     return 3 if localization.doubts else 0
 
 
 @contextmanager
-def _together(files: dict[str, str], folder: str) -> Iterator[dict[str, str]]:
-    """Give places to write files to; those of a folder of ours appear in it all together."""
+def _appearing_together(files: dict[str, str], folder: str) -> Iterator[dict[str, str]]:
+    """Give the names under which to write files; all those of a folder, which has a report, appear at once."""
     if "report" not in files:
         yield files
         return

@@ -94,7 +94,7 @@ class KobukiProtocol(HeadedFrames):
 
 
 def _sub_payloads(payload: bytes) -> Iterator[tuple[int | None, bytes]]:
-    """Yield (id, data), and (None, b"") if the last one does not end with the payload."""
+    """Yield id and data of the parts, which begin with both the id and the length; (None, b"") where the last is cut off."""
     place = 0
     while place + 2 <= len(payload):
         end = place + 2 + payload[place + 1]

@@ -171,7 +171,10 @@ def matched_by_chance(raster: CloudRasters, pairs: CloudPairs, mean: Floats) -> 
 
 
 def objects(clouds: Clouds, gap: float) -> tuple[Ints, Floats]:
-    """Return the number (p,) of the object of each point within its cloud, from 0 on, and the length (p,) of it, m."""
+    """Return of the object of each point the number (p,) within its cloud, from 0 on, and the length (p,) along its points, m.
+
+    An object is a run of points no two neighbours of which are farther apart than a gap, m.
+    """
     points, owner = clouds.points.astype(np.float64), clouds.owner
     away = np.hypot(*np.diff(points, axis=0).T) if len(points) else np.zeros(0)
     new = np.concatenate([[True], (away > gap) | (np.diff(owner) != 0)])[: len(points)]

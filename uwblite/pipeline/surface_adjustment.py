@@ -79,7 +79,7 @@ class SurfacePolicy:
 
 
 def find_surfaces(poses: Floats, scans: ScanClouds, task: Task) -> MeasuredSurfaces:
-    """Return the surfaces of the map with clouds at poses (k, 3)."""
+    """Return the walls and columns that rays show where the frames of the clouds are at poses (k, 3), and the rays on them."""
     circles, pieces, on = _shapes(scans, task, len(poses))
     columns = join_circles(circles, poses)
     around = _around(columns, poses, on.rows(slice(0)), scans, task)
