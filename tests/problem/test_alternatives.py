@@ -10,7 +10,7 @@ from uwblite import se2
 from uwblite.errors import SolverError
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.solver import optimize
-from uwblite.problem.alternatives import Alternative, EvidencePolicy, apart, compared, explanations
+from uwblite.problem.alternatives import EvidencePolicy, apart, compared, explanations
 from uwblite.problem.evidence import log_density
 
 
@@ -40,7 +40,6 @@ def test_odds_are_those_of_the_integrals_over_the_unknowns(seed):
     measured = rng.normal(size=(2, 1)) * 0.5 + noise * rng.normal(size=(2, 3))
     usual, other = solved(problem(narrow, measured)), problem(wide, measured)
     # The measurements as an edge of the prior's kind count in the density as the prior does, the same in both.
-    prior_odds = float(np.log(0.2))
 
     def evidence(graph):
         from uwblite.problem.evidence import laplace_marginal_likelihood, prior_sigma
@@ -48,7 +47,7 @@ def test_odds_are_those_of_the_integrals_over_the_unknowns(seed):
         alone = replace(graph, edges=graph.edges[:1])
         return laplace_marginal_likelihood(graph) + float(np.log(prior_sigma(graph)).sum() - np.log(prior_sigma(alone)).sum())
 
-    found = explanations(usual, lambda at: [Alternative(other, prior_odds)] if at is usual else [], solved, evidence)
+    found = explanations(usual, lambda at: [other] if at is usual else [], solved, evidence)
     odds = next(each.log_odds for each in found if each.graph is not usual)
 
     def direct(width):
@@ -57,7 +56,7 @@ def test_odds_are_those_of_the_integrals_over_the_unknowns(seed):
             for row, w in zip(measured, width, strict=True)
         )
 
-    assert odds == pytest.approx(direct(wide) - direct(narrow) + prior_odds, abs=1e-6)
+    assert odds == pytest.approx(direct(wide) - direct(narrow), abs=1e-6)
     assert [each.log_odds for each in found] == sorted((each.log_odds for each in found), reverse=True)
 
 
@@ -76,7 +75,7 @@ def test_rivals_are_compared_with_each_other_and_those_of_the_likely_lead_to_mor
     def propose(at):
         here = at.poses[1, 0]
         asked.append(here)
-        return [Alternative(replace(at, poses=path(here + 1.0).poses))] if here + 1.0 in nats else []
+        return [replace(at, poses=path(here + 1.0).poses)] if here + 1.0 in nats else []
 
     start = path(0.0)
     found = explanations(start, propose, lambda graph: graph, lambda graph: nats[graph.poses[1, 0]])
@@ -89,28 +88,26 @@ def test_rivals_are_compared_with_each_other_and_those_of_the_likely_lead_to_mor
 def test_an_optimum_that_is_known_is_no_other_and_one_that_is_open_is_none():
     start = path(1.0)
     moved = replace(start, poses=se2.compose(np.array([3.0, -1.0, 0.4]), start.poses))
-    again = explanations(start, lambda at: [Alternative(moved)], lambda graph: graph, log_density)
+    again = explanations(start, lambda at: [moved], lambda graph: graph, log_density)
     assert [each.graph for each in again] == [start]
     # An anchor at another place beside the same path is one.
     beside = replace(start, anchors=np.array([[0.0, 2.0]]), fixed_anchors=np.zeros(1, dtype=bool))
     image = replace(beside, anchors=np.array([[0.0, -2.0]]))
-    assert len(explanations(beside, lambda at: [Alternative(image)], lambda graph: graph, log_density)) == 2
+    assert len(explanations(beside, lambda at: [image], lambda graph: graph, log_density)) == 2
     # The same path by another problem is another explanation.
     other = replace(moved, edges=())
-    assert (
-        len(explanations(start, lambda at: [Alternative(other)] if at is start else [], lambda graph: graph, log_density)) == 2
-    )
+    assert len(explanations(start, lambda at: [other] if at is start else [], lambda graph: graph, log_density)) == 2
 
     def fails(graph):
         raise SolverError("open")
 
-    assert len(explanations(start, lambda at: [Alternative(path(7.0))], fails, log_density)) == 1
+    assert len(explanations(start, lambda at: [path(7.0)], fails, log_density)) == 1
     with pytest.raises(SolverError):
         explanations(start, lambda at: [], solved, fails)
-    assert compared(start, Alternative(path(7.0)), fails, log_density) is None
-    assert compared(start, Alternative(path(7.0)), lambda graph: graph, fails) is None
-    assert compared(start, Alternative(moved), lambda graph: graph, log_density) is None
-    assert compared(start, Alternative(path(7.0)), lambda graph: graph, log_density).log_odds == pytest.approx(-48.0)
+    assert compared(start, path(7.0), fails, log_density) is None
+    assert compared(start, path(7.0), lambda graph: graph, fails) is None
+    assert compared(start, moved, lambda graph: graph, log_density) is None
+    assert compared(start, path(7.0), lambda graph: graph, log_density).log_odds == pytest.approx(-48.0)
 
 
 def test_paths_are_apart_by_their_shapes():

@@ -23,7 +23,7 @@ from ..graph.calibration import BIAS, HEIGHT, RADIO, CalibrationConfig, with_fre
 from ..graph.graph import Graph, PriorEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.solver import Optimizer, SolverConfig, optimize
-from ..problem.alternatives import Alternative, EvidencePolicy, Explanation, apart, compared, explanations
+from ..problem.alternatives import EvidencePolicy, Explanation, apart, compared, explanations
 from ..problem.evidence import laplace_marginal_likelihood, log_density, prior_sigma, with_prior_sigma
 from ..problem.solution import comparable, solve
 from .estimate import Estimate, OtherHeights, Task
@@ -94,7 +94,7 @@ def _high_anchors(estimate: Estimate, config: MappingConfig, optimizer: Optimize
         return laplace_marginal_likelihood(with_free(graph, HEIGHT))
 
     present = estimate.problem
-    return compared(present, Alternative(raise_anchors(present, config.calibration)), solved, evidence)
+    return compared(present, raise_anchors(present, config.calibration), solved, evidence)
 
 
 def raise_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
@@ -147,9 +147,9 @@ def sides(graph: Graph, placed: Bools, config: SolverConfig, further: Graph | No
     graph : of one recording, optimised. placed : (a,) anchors that have a position. further : where to search as well.
     """
 
-    def propose(explanation: Graph) -> list[Alternative]:
-        starts = [further] if further is not None and explanation is graph else []
-        return [Alternative(start) for start in (*starts, *mirrored_tails(explanation, placed))]
+    def propose(explanation: Graph) -> list[Graph]:
+        starts = mirrored_tails(explanation, placed)
+        return [further, *starts] if further is not None and explanation is graph else starts
 
     return explanations(graph, propose, lambda start: optimize(start, config)[0], log_density)
 
@@ -240,7 +240,7 @@ def _elsewhere(one: Floats, other: Floats) -> Bools:
 
 def _other_optimum(graph: Graph, anchors: Floats, config: SolverConfig) -> Graph | None:
     """Return the optimum with anchors (a, 2) elsewhere and a path that follows; None where it is refuted or the present one."""
-    found = compared(graph, Alternative(replace(graph, anchors=anchors)), lambda start: optimize(start, config)[0], log_density)
+    found = compared(graph, replace(graph, anchors=anchors), lambda start: optimize(start, config)[0], log_density)
     return found.graph if found is not None and found.open else None
 
 

@@ -1,8 +1,8 @@
 """Alternatives: other explanations of the same measurements, compared by their evidence.
 
-An alternative changes a problem: its priors, what is fixed in it, or where its search begins. It is solved from the present
-estimate, and stands against all others by posterior odds: the ratio of their evidence (evidence.py) times their prior odds. One
-for which there is positive evidence is taken; one that very strong evidence does not refute stays open, for the findings.
+An alternative is a problem that was changed: its priors, what is fixed in it, or where its search begins. It is solved from
+there, and stands against all others by the odds of their evidence (evidence.py). One for which there is positive evidence is
+taken; one that very strong evidence does not refute stays open, for the findings.
 """
 
 from collections.abc import Callable, Iterable
@@ -14,7 +14,6 @@ from .. import se2
 from ..arrays import rms_length
 from ..errors import SolverError
 from ..graph.graph import Graph
-from .evidence import laplace_marginal_likelihood
 
 
 class EvidencePolicy:
@@ -34,22 +33,12 @@ class EvidencePolicy:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Alternative:
-    """A problem otherwise explained."""
-
-    start: Graph
-    """The changed problem; its estimates are where its search begins."""
-    log_odds: float = 0.0
-    """Logarithm of its prior odds against the present explanation."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Explanation:
     """A solved problem and how probable it is."""
 
     graph: Graph
     log_odds: float
-    """Logarithm of its posterior odds against the problem as it stood."""
+    """Logarithm of its odds against the problem as it stood."""
 
     @property
     def open(self) -> bool:
@@ -59,16 +48,17 @@ class Explanation:
 
 def explanations(
     present: Graph,
-    propose: Callable[[Graph], Iterable[Alternative]],
+    propose: Callable[[Graph], Iterable[Graph]],
     solve: Callable[[Graph], Graph],
-    evidence: Callable[[Graph], float] = laplace_marginal_likelihood,
+    evidence: Callable[[Graph], float],
 ) -> list[Explanation]:
     """Return the explanations of measurements, the likeliest first; the present one, among them, has odds of 1.
 
     Parameters
     ----------
     present : the problem at its optimum.
-    propose : returns alternatives to an explanation; it is asked again for those that are not hopeless.
+    propose : returns alternatives to an explanation, each with the estimates where its search begins; it is asked again for
+        explanations that are not hopeless.
     solve : returns a problem at its optimum. evidence : of an optimum, its logarithm.
 
     Raises
@@ -83,8 +73,8 @@ def explanations(
             break
         for alternative in propose(waiting.pop(0).graph):
             try:
-                graph = solve(alternative.start)
-                odds = alternative.log_odds + evidence(graph) - usual
+                graph = solve(alternative)
+                odds = evidence(graph) - usual
             except SolverError:
                 continue
             if not any(_same(graph, other.graph) for other in found):
@@ -96,10 +86,7 @@ def explanations(
 
 
 def compared(
-    present: Graph,
-    alternative: Alternative,
-    solve: Callable[[Graph], Graph],
-    evidence: Callable[[Graph], float] = laplace_marginal_likelihood,
+    present: Graph, alternative: Graph, solve: Callable[[Graph], Graph], evidence: Callable[[Graph], float]
 ) -> Explanation | None:
     """Return the explanation by one alternative; None where it is the present one, or they are not determined."""
     try:
