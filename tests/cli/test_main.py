@@ -1,5 +1,6 @@
 """The command line's frame: verbs, exit codes, errors as one line, nothing heavy before it is needed."""
 
+import errno
 import os
 import re
 import subprocess
@@ -12,6 +13,7 @@ import pytest
 import uwblite
 from uwblite import __version__
 from uwblite.cli import VERBS, main
+from uwblite.cli.console import os_error_text
 
 
 def run(*words, **options):
@@ -130,6 +132,14 @@ def test_a_current_folder_that_is_gone_is_said():
         done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False, cwd=folder, env=environment)
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
     assert done.stderr.startswith("uwblite: error: the current folder is no more")
+
+
+def test_a_file_that_fails_is_named_even_where_the_current_folder_is_gone(tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert os_error_text(OSError(errno.EACCES, "denied", "/x.log")).startswith("/x.log: denied; check who owns it")
+    assert os_error_text(OSError(errno.ENOENT, "not there")).startswith("the current folder is no more")
 
 
 def test_a_reader_that_leaves_early_does_not_disturb():

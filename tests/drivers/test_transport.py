@@ -1,13 +1,14 @@
 """Ports: those that do not open say how to mend that, those that do are held alone and hold up nobody."""
 
 import os
+import time
 from contextlib import closing
 
 import pytest
 
 from uwblite.drivers import transport
 from uwblite.drivers.devices import open_device
-from uwblite.drivers.link import Link
+from uwblite.drivers.link import BACK_OFF, Link
 from uwblite.drivers.transport import _explain, open_port
 from uwblite.errors import DeviceError
 
@@ -68,6 +69,15 @@ def test_a_device_that_takes_no_bytes_does_not_hold_up_the_others(line):
         port.write(bytes(1 << 20))
 
 
+def test_a_line_on_which_bytes_wait_is_not_gone(line):
+    """As where they come between a read that found none and the look whether the device is still there."""
+    with closing(open_port(line[1], 115200)) as port:
+        assert not port._hung_up()
+        os.write(line[0], b"here\n")
+        assert not port._hung_up()
+        assert port.read() == b"here\n"
+
+
 @pytest.mark.parametrize("end", [lambda link: link.disconnect(1.0), Link.finish])
 def test_a_link_that_ends_leaves_the_port_to_others(line, end):
     session, _ = open_device("lidar", line[1])
@@ -76,3 +86,24 @@ def test_a_link_that_ends_leaves_the_port_to_others(line, end):
     end(link)
     assert link.port is None
     open_port(port.url, 115200).close()
+
+
+def test_a_device_that_is_gone_is_looked_for_after_pauses_that_grow(line, tmp_path):
+    def connected(url, now):
+        link.url = url
+        while (port := link.connect(now, open_port)) is None:
+            time.sleep(1e-3)
+        return port
+
+    session, _ = open_device("lidar", line[1])
+    link = Link("lidar", line[1], session)
+    connected(line[1], 5.0)
+    link.disconnect(10.0)
+    waits = [link.retry_at - 10.0]
+    for now in range(20, 80, 10):
+        assert isinstance(connected(f"{tmp_path}/none", now), DeviceError)
+        waits.append(link.retry_at - now)
+    assert waits == pytest.approx([*BACK_OFF, *[BACK_OFF[-1]] * (7 - len(BACK_OFF))])
+    connected(line[1], 80.0)
+    link.disconnect(90.0)
+    assert link.retry_at == 90.0 + BACK_OFF[0]

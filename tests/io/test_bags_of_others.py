@@ -243,6 +243,15 @@ def test_ranges_between_other_nodes_are_none_of_ours(tmp_path):
     assert warned(log, "80 ranges between other nodes (n_4 to n_7, n_5 to n_7) were left out: the tag on the robot is taken")
 
 
+def test_of_many_other_nodes_three_are_named(tmp_path):
+    pairs = [("n_3", "n_7"), *(("n_3", f"n_{k}") for k in (4, 5, 6, 8)), *((f"n_{k}", "n_7") for k in (4, 5, 6, 8))]
+    rows = [odometry(1.0 + 0.1 * k, 0.1 * k) for k in range(40)]
+    rows += [(t, f"/uwb/tof/{a}/{b}/distance", "sensor_msgs/msg/Range", {"header": stamped(t), "range": 2.0})
+             for t in 1.0 + 0.1 * np.arange(40) for a, b in pairs]  # fmt: skip
+    log = read_bag(bag(tmp_path, rows))
+    assert warned(log, "160 ranges between other nodes (n_4 to n_7, n_5 to n_7, n_6 to n_7 ...) were left out")
+
+
 def test_arrays_beside_each_other_are_guessed(tmp_path):
     definitions = {"x_msgs/msg/UwbRanges": f"{HEADER} header\nint32[] destination_id\nfloat64[] distance"}
     message = {"header": stamped(1.0), "destination_id": [7, 9], "distance": [1500.0, 3250.0]}

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from uwblite.localization import window as module
 from uwblite.localization.walls import Rays
 from uwblite.localization.window import Window, WindowLook, WindowRange
 
@@ -38,3 +39,10 @@ def test_a_robot_that_stands_keeps_one_scan_the_newest_and_one_that_creeps_keeps
     assert not window.wants_look(4.2, 9.0)
     window.add_look(look(4.5, 10.0))
     assert [kept.stamp for kept in window.looks] == [6.0, 10.0]
+
+
+def test_a_robot_that_has_gone_as_far_as_counts_keeps_both_scans():
+    window = Window([look(0.0, 5.0)])
+    assert not window.wants_look(module._STANDING, 60.0)
+    window.add_look(look(module._STANDING, 60.0))
+    assert [kept.stamp for kept in window.looks] == [5.0, 60.0]

@@ -56,26 +56,15 @@ class CorrelativeConfig:
     """Of the best score, that another candidate must reach."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SearchResult:
-    """Peaks of the score, the best first."""
-
-    poses: Floats
-    """(c, 3) T_target_source; m, m, rad; on the grid."""
-    scores: Floats
-    """(c,) at most 1; mean agreement of the source's points."""
-
-
 def search(
     target: Clouds, source: Clouds, T_target_source: Floats, window: Window, config: CorrelativeConfig | None = None
-) -> SearchResult:
-    """Score every pose of a grid around a guess (3,) of one cloud in another, and return the best few; none where none fits."""
+) -> Floats:
+    """Return the poses (c, 3) around a guess of one cloud in another at which their score peaks; the best first, or none."""
     config = config or CorrelativeConfig()
     scores, headings, shift_x, shift_y = score_grid(target, source, T_target_source, window, config)
-    turn, row, column = found = _peaks(scores, config).T
+    turn, row, column = _peaks(scores, config).T
     shift = np.stack([shift_x[column], shift_y[row]], axis=1) * config.resolution
-    poses = np.column_stack([T_target_source[:2] + shift, se2.wrap_angle(headings[turn])])
-    return SearchResult(poses, scores[tuple(found)].astype(np.float64))
+    return np.column_stack([T_target_source[:2] + shift, se2.wrap_angle(headings[turn])])
 
 
 def score_grid(

@@ -225,7 +225,7 @@ def _starts(objects: ObjectLikelihood, pairs: CloudPairs, prior: Gaussian) -> tu
         low, high = (np.clip(mean[:2] + side * reach[:2], -view, view) for side in (-1.0, 1.0))
         middle, (wide, tall) = np.append(0.5 * (low + high), mean[2]), 0.5 * (high - low)
         window = float(wide), float(tall), min(float(reach[2]), np.pi)
-        found = correlative_matching.search(target, source, middle, window, config).poses
+        found = correlative_matching.search(target, source, middle, window, config)
         starts.append(np.concatenate([found, mean[None]])[: config.candidates])
     counts = np.array([len(each) for each in starts], dtype=np.intp)
     return np.repeat(np.arange(len(pairs)), counts), np.concatenate([np.zeros((0, *se2.POSE)), *starts])
@@ -242,7 +242,7 @@ def _most_odds(placed: Placed, prior: Prior) -> Floats:
 def descend(objects: ObjectLikelihood, pairs: CloudPairs, start: Floats, prior: Gaussian) -> Placed:
     """Place the sources of pairs (e,) in their targets by matches and a prior, each from its start (e, 3)."""
     c, scale = PairPolicy, objects.sigma**2 * PairPolicy.correlation
-    information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
+    information = np.linalg.inv(prior.covariance)
     pose, gate, temper, left = start.copy(), c.reach, 1.0, np.arange(len(pairs))
     for _ in range(c.iterations):
         factors = objects.match(pairs.rows(left), pose[left], gate, prior.covariance[left] * temper)[0]

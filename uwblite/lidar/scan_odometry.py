@@ -125,7 +125,7 @@ def _searched(raster: CloudRasters, pair: CloudPairs, guess: Floats) -> tuple[Fl
     """Return the best pose (3,) of the source of one pair around a guess, and the share of points that match there."""
     target, source = (raster.clouds.chosen(of) for of in (pair.i, pair.j))
     half = ScanStepPolicy.search
-    places = search(target, source, guess, (half, half, half)).poses
+    places = search(target, source, guess, (half, half, half))
     if not len(places):
         return guess, 0.0
     pairs = pair.rows(np.zeros(len(places), dtype=np.intp))

@@ -134,7 +134,7 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
             turn = float(np.clip(turn, MatchingPolicy.least_turn, config.search_angle))
             target, source = (chosen(int(of[k])) for of in (candidates.target, candidates.source))
             centre, half_widths = _window(poses[0], float(candidates.spread[k]), turn, target, source)
-            poses = search(target, source, centre, half_widths, search_config).poses[:places]
+            poses = search(target, source, centre, half_widths, search_config)[:places]
         rows.append(np.full(len(poses), k))
         guesses.append(poses)
     return np.concatenate(rows).astype(np.intp), np.concatenate(guesses)
