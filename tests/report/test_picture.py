@@ -11,7 +11,7 @@ from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.png import decode_png, encode_png
 from uwblite.report.canvas import ACCEPTED, ANCHOR, HEIGHT, PATHS, PROPOSED, START, WIDTH, Canvas, rgb, text_mask
 from uwblite.report.drawn_map import DrawnAnchor, DrawnClosure, DrawnMap
-from uwblite.report.picture import FLOOR, INK, PAPER, WALL, Key, _paste, draw_errors, draw_map, rows_of, side_by_side
+from uwblite.report.picture import FLOOR, INK, PAPER, WALL, Key, _legend, _paste, draw_errors, draw_map, rows_of, side_by_side
 from uwblite.report.svg_map import round_length
 
 
@@ -184,6 +184,27 @@ def test_the_legend_is_of_what_is_drawn_and_never_cut():
     plain, with_anchor = draw_map(DrawnMap(room(), [PATH_IN_ROOM])), draw_map(DrawnMap(room(), [PATH_IN_ROOM], [anchor]))
     assert share(plain[-26:], ANCHOR) == 0
     assert share(with_anchor[-60:], ANCHOR) > 0
+
+
+def test_the_legend_names_every_part_that_is_drawn_and_no_other():
+    here, step = np.zeros(2), np.array([[0.0, 0.0], [1.0, 0.0]])
+    anchor, measured = DrawnAnchor("A", here), DrawnAnchor("A", here, np.eye(2))
+    proposed, lost = DrawnAnchor("new1", here, kind="proposed"), DrawnAnchor("lost", np.full(2, np.nan))
+    way = ["path", "start", "end"]
+    for drawn, entries in (
+        (DrawnMap(room()), []),
+        (DrawnMap(room(), [step]), way),
+        (DrawnMap(room(), [step] * 2), ["recording 1", "recording 2", "start", "end"]),
+        (DrawnMap(None, (), [lost]), []),
+        (DrawnMap(None, (), [anchor, lost]), ["anchor"]),
+        (DrawnMap(None, (), [anchor, measured]), ["anchor, 2 sigma"]),
+        (DrawnMap(None, (), [proposed]), ["proposed"]),
+        (DrawnMap(None, (), [anchor, proposed]), ["anchor", "proposed"]),
+        (DrawnMap(None, [step], (), [DrawnClosure(step, False)]), way),
+        (DrawnMap(None, [step], (), [DrawnClosure(step, False), DrawnClosure(step, True)]), [*way, "loop closure"]),
+        (DrawnMap(None, [step], doubted=[step]), [*way, "not to be trusted"]),
+    ):
+        assert [key.text for key in _legend(drawn)] == entries
 
 
 def test_the_origin_and_the_axes_are_on_it():

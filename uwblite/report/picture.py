@@ -247,7 +247,7 @@ def _legend(drawn: DrawnMap) -> list[Key]:
     names = ["path"] if many == 1 else [f"recording {k + 1}" for k in range(many)]
     keys = [_mark(name, colour, "line") for name, colour in zip(names, PATHS, strict=False)]
     keys += [_mark("start", START, "disc"), _mark("end", PATHS[0], "ring")] if many else []
-    kinds = {a.kind for a in drawn.anchors if np.isfinite(a.position).all()}
+    kinds = {a.kind for a in drawn.placed()}
     ellipses = any(a.covariance is not None for a in drawn.anchors)
     keys += [_mark("anchor, 2 sigma" if ellipses else "anchor", ANCHOR, "triangle")] if kinds - {"proposed"} else []
     keys += [_mark("proposed", PROPOSED, "triangle")] if "proposed" in kinds else []
