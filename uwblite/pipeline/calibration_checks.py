@@ -15,7 +15,7 @@ from ..errors import SolverError
 from ..graph.calibration import TURNING, with_free
 from ..graph.marginals import marginals
 from ..graph.pose_edges import ScanEdges
-from ..graph.solver import Optimizer, optimize
+from ..graph.solver import optimize
 from ..lidar.joint_refinement import RefinementConfig
 from ..lidar.scan_duration import PARTS, MovedRays, missing_duration
 from ..lidar.scan_matching import pairs_of
@@ -88,7 +88,7 @@ def with_slip_in_turns(estimate: Estimate, task: Task) -> Estimate:
     sigma[slips] = max(abs(offset) * np.sqrt(share), policy.small)
     sigma[at] = max(abs(offset) * np.sqrt(1.0 - share), policy.small)
     estimate = replace(estimate, graph=with_free(with_prior_sigma(graph, sigma), TURNING))
-    return estimate.with_estimates_of(Optimizer().optimize(estimate.problem, task.config.solver)[0])
+    return estimate.with_estimates_of(optimize(estimate.problem, task.config.solver)[0])
 
 
 def with_units_checked(config: MappingConfig, logs: Sequence[SensorLog]) -> MappingConfig:
