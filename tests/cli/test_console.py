@@ -16,14 +16,7 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.fixture(autouse=True)
-def _quiet_afterwards():
-    yield
-    console.set_up()
-
-
 def test_report_and_note_go_to_their_streams(capsys):
-    console.set_up()
     console.say("result")
     console.note("beside")
     assert capsys.readouterr() == ("result\n", "beside\n")

@@ -90,7 +90,6 @@ def test_names_that_are_no_text_reach_no_terminal_and_spoil_no_result(folder):
 
 
 def test_a_line_holds_nothing_that_a_terminal_obeys(capsys):
-    console.set_up()
     console.say("a\x1b[2Jb\nc\u202ed\udcff")
     console.note("\x9b1m\r")
     console.fail("x\x07\ny", 1)
