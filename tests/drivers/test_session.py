@@ -2,7 +2,8 @@
 
 import pytest
 
-from uwblite.drivers.events import Corrupt, Note, Send
+from uwblite.drivers.devices import DEVICES, open_device
+from uwblite.drivers.events import Corrupt, Note, Send, SetDtr
 from uwblite.drivers.session import Driver, Session, Wait
 
 NOISE = Corrupt("noise")
@@ -91,3 +92,21 @@ def test_the_last_thing_that_was_understood_has_a_time():
     session.feed(b"a", 2.0)
     session.feed(b"?", 3.0)
     assert session.last_event == 2.0
+
+
+LAST_WORDS = {
+    "create2": [Send(b"\x96\x00")],
+    "scip": [Send(b"QT\n")],
+    "ydlidar-x2": [SetDtr(False)],
+    "ydlidar-x4": [Send(b"\xa5\x65"), SetDtr(False)],
+    "rplidar": [Send(b"\xa5\x25"), Send(b"\xa5\xf0\x02\x00\x00\x57"), SetDtr(True)],
+    "lds01": [Send(b"e")],
+}
+"""What makes a device fall quiet and its motor stand, by its manual."""
+
+
+@pytest.mark.parametrize("kind", DEVICES.values(), ids=DEVICES)
+def test_a_device_that_is_let_go_falls_quiet_and_its_motor_stands(kind):
+    session, _ = open_device(kind.sensor, f"{kind.name}:/dev/none")
+    session.start(1.0)
+    assert session.stop() == LAST_WORDS.get(kind.name, [])

@@ -8,7 +8,7 @@ import pytest
 
 from uwblite.drivers import transport
 from uwblite.drivers.devices import open_device
-from uwblite.drivers.link import BACK_OFF, Link
+from uwblite.drivers.link import BACK_OFF, HANG, Link
 from uwblite.drivers.transport import _explain, open_port
 from uwblite.errors import DeviceError
 
@@ -107,3 +107,24 @@ def test_a_device_that_is_gone_is_looked_for_after_pauses_that_grow(line, tmp_pa
     connected(line[1], 80.0)
     link.disconnect(90.0)
     assert link.retry_at == 90.0 + BACK_OFF[0]
+
+
+@pytest.mark.parametrize(
+    ("message", "event", "data", "words"),
+    [
+        (0.0, 0.0, 0.0, "check power and cable"),
+        (0.0, 0.0, HANG, "bytes come, but no good frame"),
+        (0.0, HANG, HANG, "it answers, but measures nothing"),
+        (HANG, HANG, HANG, None),
+    ],
+)
+def test_a_port_is_opened_again_where_no_byte_comes_and_a_device_that_is_silent_is_said_with_the_cause(
+    line, message, event, data, words
+):
+    session, _ = open_device("lidar", line[1])
+    for later, hangs in ((0.0, False), (1.0, data < HANG)):
+        link = Link("lidar", line[1], session)
+        link.last_message, link.last_data, session.last_event = 50.0 + message, 50.0 + data, 50.0 + event
+        note, again = link.watch(50.0 + HANG + later)
+        assert again is hangs
+        assert note is None if words is None else words in note.text
