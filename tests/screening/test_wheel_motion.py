@@ -18,7 +18,6 @@ from uwblite.screening.wheel_motion import (
     _chosen,
     _smooth_steps,
     _span,
-    _turn_otherwise,
     compare,
     disagreeing,
     lidar_by_wheels,
@@ -251,17 +250,6 @@ def test_small_turns_that_all_differ_from_half_time_are_said(factor, share, said
     for fact in facts:
         assert fact.figures["stretches"] == [pytest.approx((120.0, 237.5), abs=3.5)]
         assert not fact.figures["slips"]
-
-
-@pytest.mark.parametrize("missing", [0, 1])
-def test_turns_differ_where_as_many_clear_ones_as_count_do(missing):
-    """Pairs of a straight way lie between; those before the first and after the last clear turn are of no stretch."""
-    count = 2 * PairPolicy.enough - missing
-    turns = np.zeros(3 * count + 2)
-    turns[3 : 3 * count + 1 : 3] = 0.04
-    of_a_stretch = np.arange(len(turns)) >= 3
-    of_a_stretch &= np.arange(len(turns)) <= 3 * count
-    assert _turn_otherwise(turns, -turns).tolist() == (of_a_stretch & (not missing)).tolist()
 
 
 def test_scans_that_have_nothing_in_common_with_the_wheels_replace_none():
