@@ -57,11 +57,10 @@ class _HashingReader(io.RawIOBase):
         return True
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        data = self._stream.read(len(buffer))
-        self.hash.update(data)
-        self.count += len(data)
-        buffer[: len(data)] = data
-        return len(data)
+        count: int = self._stream.readinto(buffer)  # type: ignore[attr-defined]
+        self.hash.update(buffer[:count])
+        self.count += count
+        return count
 
 
 class TextSource:
@@ -102,11 +101,10 @@ class TextSource:
                 if cut < 0:
                     continue
                 data, overlong = OVERLONG_LINE + data[cut:], False
-            text = carry + data
-            cut = text.rfind(b"\n") + 1
+            cut = data.rfind(b"\n") + 1
             if cut:
-                yield text[:cut]
-            carry = text[cut:]
+                yield b"".join((carry, memoryview(data)[:cut]))
+            carry = data[cut:] if cut else carry + data
             if len(carry) > MAX_LINE_BYTES:
                 carry, overlong = b"", True
         if first:

@@ -9,21 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import (
-    WIDE,
-    Bools,
-    Floats,
-    Ints,
-    Table,
-    Wides,
-    as_array,
-    dots,
-    numbered,
-    require_finite,
-    require_shape,
-    run_starts,
-    stable_order,
-)
+from ..arrays import WIDE, Bools, Floats, Ints, Table, Wides, as_array, require_finite, require_shape, run_starts, stable_order
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -101,21 +87,22 @@ def neighbour_pairs(owner: Ints, points: Floats, radius: float) -> tuple[Ints, I
     With squares as wide as the radius, both points are in one square or in two that touch. Squares are numbered column by
     column, an empty one behind each column and an empty column behind each owner, so that those that touch one are three runs.
     """
-    x, y = np.floor(np.ascontiguousarray(points.T) / radius).astype(WIDE)
-    x -= x.min(initial=0)
-    y -= y.min(initial=0)
-    high = y.max(initial=0) + 2
-    square = (owner * (x.max(initial=0) + 2) + x) * high + y
+    x, y = np.ascontiguousarray(points.T)
+    column, row = (np.floor(values / radius).astype(WIDE) for values in (x, y))
+    column -= column.min(initial=0)
+    row -= row.min(initial=0)
+    high = row.max(initial=0) + 2
+    square = (owner * (column.max(initial=0) + 2) + column) * high + row
     order = stable_order(square)
-    square = square[order]
+    square, x, y = (values.take(order) for values in (square, x, y))
     # What follows in the same square or lies in the next one of its column, then the three squares of the next column.
-    first = np.concatenate([np.arange(1, len(order) + 1), np.searchsorted(square, square + high - 1)])
-    end = np.searchsorted(square, np.concatenate([square + 1, square + high + 1]), "right")
-    run, place = numbered(end - first)
-    i, j = order[run % max(len(order), 1)], order[first[run] + place]
-    apart = points.take(j, axis=0) - points.take(i, axis=0)
-    near = dots(apart, apart) <= radius * radius
-    return i[near], j[near]
+    here = np.arange(len(order))
+    first = np.concatenate([here + 1, np.searchsorted(square, square + high - 1)])
+    count = np.searchsorted(square, np.concatenate([square + 1, square + high + 1]), "right") - first
+    i = np.repeat(np.concatenate([here, here]), count)
+    j = np.arange(len(i)) + np.repeat(first + count - np.cumsum(count), count)
+    near = np.flatnonzero((x.take(j) - x.take(i)) ** 2 + (y.take(j) - y.take(i)) ** 2 <= radius**2)
+    return order.take(i.take(near)), order.take(j.take(near))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
