@@ -219,7 +219,7 @@ def test_what_fills_up_a_stretch_counts_for_nothing():
         alone = Stretches.of([own], begins[number], ends[number])
         assert there.sum() == together.counts[row] == alone.counts[0]
         assert set(together.stamps[row][together.counted[row] > 0.0]) == set(own.stamps[there])
-        for of in (lambda s: s.likely, lambda s: s.driven(20.0), lambda s: s.nothing(20.0)):
+        for of in (lambda s: s.likely, lambda s: s.driven(20.0)):
             np.testing.assert_allclose(of(together)[row], of(alone)[0], rtol=1e-9)
 
 

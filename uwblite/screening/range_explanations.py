@@ -299,10 +299,6 @@ class Stretches(Table):
 
         return np.asarray(np.logaddexp(within(way), within(2.0 * way)) - np.log(2.0) - np.log(longest))
 
-    def nothing(self, longest: float) -> Floats:
-        """Return log likelihoods (p, 1) of the readings if they may be any numbers up to the longest, m."""
-        return np.asarray(-self.counts[:, None] * float(np.log(longest)))
-
 
 def _on_stretches(log: SensorLog, every: Stretches, offsets: Floats, longest: float) -> Floats:
     """Return log likelihoods (g, s, h) of s stretches, for g scales of errors, if the way by the wheels has a factor, or the
@@ -342,7 +338,7 @@ def _at_moments(
     one, other = (side.trace * len(moments) + side.number for side in sides)
     before, after = sides[0].rows(np.isin(one, other)), sides[1].rows(np.isin(other, one))
     each, likely = np.arange(len(before.trace)), np.zeros((len(moments), 2, len(PathPolicy.noise)))
-    as_driven = Moment(before, after, [], longest).same(each, each, np.zeros((1, 3)))[..., 0].T
+    as_driven = Moment(before, after, [], longest).same(each, each, np.zeros((1, *se2.POSE)))[..., 0].T
     np.add.at(likely, before.number, np.stack([as_driven, before.likely + after.likely], axis=1))
     path, any_place = likely.max(axis=2).T
     for k in np.flatnonzero(path < any_place - EvidencePolicy.very_strong).tolist():
@@ -468,8 +464,8 @@ class Moment:
             # The number of cycles of so many of the anchors.
             gain -= math.lgamma(count + 1.0) - math.lgamma(count - len(changed) + 1.0) - math.log(len(changed))
             yield Explanation(gain + prior, kind, {"exchanged": True, "anchors": changed}, names=names)
-        unordered = (one.nothing(self.longest) + two.likely, one.likely + two.nothing(self.longest))
-        nowhere = max(float(side.sum(axis=0).max()) for side in unordered)
+        number = -float(np.log(self.longest))
+        nowhere = max(float(a.likely.sum(axis=0).max() + number * b.counts.sum()) for a, b in ((one, two), (two, one)))
         yield Explanation(nowhere + prior, kind, {"exchanged": False, "anchors": changed})
 
 
