@@ -1,6 +1,9 @@
 """Two tags and two lidars in one recording, kept apart."""
 
 import math
+import socketserver
+import threading
+import time
 
 import pytest
 from emulators.kobuki_device import KobukiDevice
@@ -81,3 +84,27 @@ def test_one_port_for_two_devices_is_refused(tmp_path, capsys):
     ports = ["--uwb", "tlv:/dev/null", "--lidar", f"scip:{tmp_path / 'again'}"]
     assert main(["record", *ports, "--out", str(tmp_path / "run.log")]) == 1
     assert "lidar and uwb are given the same port" in capsys.readouterr().err
+
+
+class Robot(socketserver.StreamRequestHandler):
+    """Send poses and ranges, in lines, to every client."""
+
+    def handle(self):
+        for k in range(40):
+            try:
+                self.wfile.write(f"ODO {20 * k},0.{k:02d},0.0,0.0\nUWB {20 * k},A1,2.{k:02d}\n".encode())
+            except OSError:
+                return
+            time.sleep(0.02)
+
+
+def test_two_devices_are_clients_of_one_server(tmp_path):
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Robot) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        place = f"line:socket://127.0.0.1:{server.server_address[1]}?time_unit=0.001&columns=t,"
+        ports = ["--odometry", f"{place}x,y,theta&prefix=ODO", "--uwb", f"uwb-{place}id,range&prefix=UWB"]
+        main(["record", *ports, "--out", str(tmp_path / "run.log"), "--duration", "0.6"])
+        server.shutdown()
+    kinds = [line.split()[0] for line in (tmp_path / "run.log").read_text().splitlines()]
+    assert kinds.count("ODOM") >= 5
+    assert kinds.count("UWB") >= 5

@@ -172,11 +172,13 @@ def device_links(args: argparse.Namespace, pose: Pose = (0.0, 0.0, 0.0)) -> list
             links.append(Link(sensor, url, session, k))
     ports: dict[str, str] = {}
     for link in links:
+        check_url(link.url)
+        if is_socket(link.url):
+            # A server may have several clients.
+            continue
         if (other := ports.setdefault(os.path.realpath(link.url), link.name)) != link.name:
             raise ConfigError(f"{other} and {link.name} are given the same port, {link.url}: a port has one device")
-        check_url(link.url)
-        if not is_socket(link.url):
-            pyserial()
+        pyserial()
     return links
 
 
