@@ -40,8 +40,11 @@ def test_likelihoods_in_single_precision_are_those_in_double_to_a_thousandth():
     pose, ranges = some_ranges(6)
     poses = pose + np.random.default_rng(6).normal(0.0, 2.0, (200, 3))
     error = range_model.range_errors(poses, ranges)[0]
-    mixtures = [RangeMixture(0.0, s, 0.2, 0.5, 0.05, 60.0) for s in ranges.sigma]
-    terms = np.stack([m.density(e) * m.sigma * np.sqrt(2.0 * np.pi) for m, e in zip(mixtures, error.T, strict=True)], axis=1)
+    # Of all, a fifth has a detour, 0.03 are an echo's, and 0.03 anything.
+    parts = (0.2, 0.5, 0.06, 120.0), (1.0, 4.0, 0.0, 1.0)
+    detours, echoes = ([RangeMixture(0.0, sigma, *part) for sigma in ranges.sigma] for part in parts)
+    densities = [d.density(e) + 0.03 * m.density(e) for d, m, e in zip(detours, echoes, error.T, strict=True)]
+    terms = np.stack(densities, axis=1) * ranges.sigma * np.sqrt(2.0 * np.pi)
     # One after another: the error stays what it was, or is drawn anew.
     chain = range_model.series(ranges)
     for k in range(3, 12):
@@ -70,7 +73,7 @@ def test_the_stay_is_the_renewal_law_whatever_the_steps_are():
     still = replace(ranges, tags=np.zeros((12, 2)))
     many = range_model.series(still).stay[3::3].prod()
     one = range_model.series(still.rows(np.array([0, 9]))).stay[1]
-    np.testing.assert_allclose(many / 0.95**3, one / 0.95, rtol=1e-9)
+    np.testing.assert_allclose(many / 0.97**3, one / 0.97, rtol=1e-9)
     first = range_model.series(replace(still, way=0.1 * still.way))
     np.testing.assert_array_equal(first.before[:4], [0, 1, 2, 0])
     np.testing.assert_array_equal(first.share[:3], 1.0)
@@ -80,7 +83,7 @@ def test_the_stay_is_the_renewal_law_whatever_the_steps_are():
 def test_two_tags_that_measure_at_once_are_two_places():
     _, ranges = some_ranges(1)
     two = replace(ranges.rows(np.array([0, 3])), way=np.zeros(2), tags=np.array([[0.0, 0.0], [0.4, 0.0]]))
-    np.testing.assert_allclose(range_model.series(two).stay[1], 0.95 * np.exp(-0.4 / 1.5))
+    np.testing.assert_allclose(range_model.series(two).stay[1], 0.97 * np.exp(-0.4 / 1.5))
 
 
 def test_errors_that_the_map_s_own_ranges_had_at_a_place_are_expected_there():
@@ -99,3 +102,10 @@ def test_errors_that_the_map_s_own_ranges_had_at_a_place_are_expected_there():
     none = range_model.range_likelihood(pose[None], replace(ranges, values=exact), expected=np.zeros((1, 12)))
     np.testing.assert_allclose(best, none, rtol=1e-4)
     assert best[0] > range_model.range_likelihood(pose[None], late)[0] + 1.0
+
+
+def test_an_echo_of_metres_is_likelier_than_a_range_that_is_as_much_too_short_or_far_too_long():
+    errors = np.array([6.0, -6.0, 25.0])
+    _, (long, short, far) = range_model.mixture(errors, np.full(3, 0.17))
+    assert long > 3.0 * short
+    assert long > 3.0 * far

@@ -42,9 +42,9 @@ def test_a_range_corrects_as_a_kalman_filter_with_the_numeric_jacobian():
 def test_a_range_that_is_metres_late_moves_nothing():
     bank = a_bank(1)
     anchors = anchors_at(np.array([[4.0, -2.0], [9.0, 9.0]]), 0.1)
-    found, weight, likelihood, anywhere = ranged(bank, anchors, 0, 60.0, np.zeros(2))
-    # 0.05 of such ranges over 60 m, against one over 30 m: the likelihood of one that comes from anywhere is 40 times as large.
-    np.testing.assert_allclose(anywhere - likelihood, np.log(40.0), atol=1e-6)
+    found, weight, likelihood, anywhere = ranged(bank, anchors, 0, 160.0, np.zeros(2))
+    # 0.03 of such ranges over 60 m, against one over 30 m: that of one that comes from anywhere is 200 / 3 times as large.
+    np.testing.assert_allclose(anywhere - likelihood, np.log(200.0 / 3.0), atol=1e-6)
     assert weight[0] < 1e-3
     np.testing.assert_array_equal(found.mean, bank.mean)
 

@@ -21,6 +21,7 @@ from .hypotheses import Hypotheses
 from .known_map import KnownMap
 from .range_model import repeated
 from .running_fit import SUPPORT, full_agreement
+from .search import MOST_PLACES
 from .walls import ELSEWHERE, INDEPENDENT_RAYS, PER_FACTOR, PER_RAY, Agreement, Rays, Walls
 from .window import RAYS, Window, WindowLook, WindowRange, way_of
 
@@ -28,13 +29,9 @@ _FRESH_WAY = _UNFELT = 0.1
 """m; the error of a scan taken so far from the last one is independent of the last one's; nearer, in proportion. And m and rad,
 motion between two scans that the wheels do not measure, of a robot that is pushed or whose wheels are frozen."""
 _STILL = 1e-3
-"""m; a robot that has driven less stands."""
-_LEAST_FRESH = 0.02
-"""Least share of a scan that is new; those of a robot that stands repeat one another."""
+"""m; a robot that has driven less stands, and its scans repeat one another: each is as new as after so much."""
 _SEARCH_TIME = 0.5
 """s between two searches."""
-_MOST, _FORGET = 40, -2.0 * verdict.CERTAIN
-"""Most hypotheses, and log-weight below which one is removed."""
 _STANDS = np.zeros(se2.POSE)
 _SCANS_DIFFER = "the scans do not fit the walls any more"
 
@@ -220,7 +217,7 @@ class PoseEstimator:
 
         Driven is how far the robot has come since its last scan, m.
         """
-        bank = hypotheses.matched(bank, walls, rays, float(np.clip(driven / _FRESH_WAY, _LEAST_FRESH, 1.0)))
+        bank = hypotheses.matched(bank, walls, rays, min(max(driven, _STILL) / _FRESH_WAY, 1.0))
         self.work += len(bank) * (hypotheses.MATCHES * PER_FACTOR * len(rays.hit) + PER_RAY * len(some.hit))
         return bank, walls.agreement(bank.poses, some, INDEPENDENT_RAYS * min(driven, 1.0))
 
@@ -248,7 +245,7 @@ class PoseEstimator:
             return
         best = int(np.argmax(found.weight))
         # Several poses that were tried may have moved to one place, which counts once.
-        self._bank = hypotheses.pruned(found.hypotheses, _MOST, _FORGET)
+        self._bank = hypotheses.pruned(found.hypotheses, MOST_PLACES, -2.0 * verdict.CERTAIN)
         ranges, pose = found.ranges, self._bank.poses[0].copy()
         alone = found.complete and verdict.odds_of_place(self._bank) > verdict.LIKELY
         agreed = self._agreed(pose if alone else None)

@@ -20,10 +20,10 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, chunks
+from ..arrays import Bools, Floats, Ints, chunks, evenly
 from ..grid.occupancy_grid import FREE
 from .hypotheses import MATCHES, SAME, apart, refined
-from .range_model import PER_RANGE, Ranges, range_likelihood
+from .range_model import FEW, PER_RANGE, Ranges, range_likelihood
 from .verdict import CERTAIN, FEW_BESIDE, FEW_ENDS, SURE
 from .walls import INDEPENDENT_RAYS, MOST_CELLS, ON_WALL, STRANGE, Rays, Walls
 
@@ -149,7 +149,7 @@ def _thinned(rays: Rays) -> Floats:
     points = rays.ends[rays.hit & (np.hypot(*rays.ends.T) < FARTHEST)]
     _, first = np.unique(np.floor(points / _SPREAD).astype(np.intp), axis=0, return_index=True)
     chosen = np.sort(first)
-    return points[chosen[np.unique(np.linspace(0, len(chosen) - 1, _POINTS).astype(np.intp))]] if len(chosen) else points[:0]
+    return points[chosen[evenly(len(chosen), _POINTS)]]
 
 
 def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Steps:
@@ -206,7 +206,7 @@ def _likely(poses: Floats, ranges: Ranges, wider: float, scans: Floats | float =
 
     Of poses of a grid every sigma of a range is wider, see range_likelihood.
     """
-    few, weight = ranges.spread(), np.zeros(len(poses)) + scans
+    few, weight = ranges.rows(evenly(len(ranges), FEW)), np.zeros(len(poses)) + scans
     for part in units(len(poses), PER_RANGE * len(few)):
         weight[part] += range_likelihood(poses[part], few, wider)
         yield PER_RANGE * len(few) * len(poses[part])
@@ -290,7 +290,7 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
         return _UNDECIDED
     poses = np.column_stack([np.repeat(cells, len(headings), axis=0), np.tile(headings, len(cells))])
     likely = yield from _likely(poses, ranges, np.sqrt(0.5) * step)
-    found, few = (yield from _distinct(likely, _MOST_RIVALS, True)), ranges.spread()
+    found, few = (yield from _distinct(likely, _MOST_RIVALS, True)), ranges.rows(evenly(len(ranges), FEW))
     tried = found.poses
     for part in units(len(tried), _PER_REFINED * len(few)):
         tried[part] = refined(tried[part], few)

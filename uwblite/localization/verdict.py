@@ -17,6 +17,8 @@ from .walls import Rays, Walls
 
 CERTAIN, LIKELY = (float(np.log(odds)) for odds in (400.0, 20.0))
 """Log-likelihoods of a certain place, and of a likely one."""
+_ALONE = float(np.log(1000.0))
+"""Of a start against all other places: a wrong one is worse than one that is some decimetres later."""
 _FOUND, _VAGUE = 2.0, 1.25
 """Standard deviations that a pose must be known to within one place (hypotheses.SAME) to be found, and not to be lost again: by
 more than 20 : 1, and by 4 : 1."""
@@ -42,9 +44,9 @@ def undecided(bank: Hypotheses, complete: bool) -> str:
     """Return why another place than the first, the likeliest, may be right; "" = none may. complete : no place was left out."""
     if not complete:
         return "too many places are as likely; drive on"
-    if odds_of_place(bank) > CERTAIN:
+    if odds_of_place(bank) > _ALONE:
         return ""
-    count = int((bank.log_weight[hypotheses.apart(bank.poses[0], bank.poses)] > -CERTAIN).sum())
+    count = int((bank.log_weight[hypotheses.apart(bank.poses[0], bank.poses)] > -_ALONE).sum())
     return f"{1 + max(count, 1)} places are as likely; drive on, around a corner or past another anchor"
 
 

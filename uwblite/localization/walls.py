@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
 
 from .. import se2
-from ..arrays import Bools, Floats, Table, unique_rows
+from ..arrays import Bools, Floats, Table, evenly, unique_rows
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridConfig, OccupancyGrid
 from ..lidar.object_likelihood import ObjectPolicy
@@ -69,7 +69,7 @@ class Rays(Table):
 
     def spread(self, count: int) -> "Rays":
         """Return at most so many rays, evenly spread."""
-        return self if len(self.hit) <= count else self.rows(np.linspace(0, len(self.hit) - 1, count).astype(np.intp))
+        return self.rows(evenly(len(self.hit), count))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
