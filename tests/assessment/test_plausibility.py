@@ -325,16 +325,3 @@ def test_a_lidar_whose_ways_differ_by_more_than_15_percent_from_the_wheels_is_na
     assert [n.figures["lidar_by_wheels"] for n in found if n.severity == "doubt"] == ([] if said is None else [said])
 
 
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("ratio", [1.2, 0.001, 0.0, -0.001])
-def test_a_map_as_long_as_the_wheels_count_has_no_other_scale(ratio):
-    """Pairs of single scans that show little have one error in common, or no motion at all; the map's steps do not."""
-    walk, rng = np.zeros((40, 3)), np.random.default_rng(1)
-    walk[:, 0] = 0.1 * np.arange(40)
-    screening = Screening((), OdometryBreaks.none(), lidar_by_wheels=ratio)
-    recordings = recordings_of(walk, lidar=True, each=[{"screening": screening}])
-    said = {}
-    for longer in (1.0, 1.1, 1.2):
-        path = walk * [longer, 1.0, 1.0] + rng.normal(0.0, 0.002, (40, 3))
-        said[longer] = [f.kind for f in check_lengths(estimate_of(Graph(path)), task_of(recordings))]
-    assert said == {1.0: [], 1.1: [], 1.2: ["scales"]}

@@ -26,11 +26,13 @@ def seen(mounting=NOMINAL, **settings):
 @pytest.mark.parametrize("mounting", [NOMINAL, BEHIND])
 def test_motions_are_found_whatever_the_mounting(mounting):
     lidar, exact = seen(mounting, noise=0.005, rng=np.random.default_rng(1))
-    found, share = scan_steps(lidar, mounting, FIRST, SECOND, exact + np.array([0.05, -0.04, 0.03]))
+    found, share, information = scan_steps(lidar, mounting, FIRST, SECOND, exact + np.array([0.05, -0.04, 0.03]))
     error = se2.between(exact, found)
     assert np.abs(error[:, :2]).max() < 0.01
     assert np.abs(error[:, 2]).max() < 0.005
     assert share.min() > 0.8
+    # A hundred points and more, each with its normal in some direction.
+    assert np.all(np.linalg.eigvalsh(information)[:, 0] > 10.0)
     right, wrong = (misfits(lidar, mounting, FIRST, SECOND, exact + off) for off in (np.zeros(3), np.array([0.1, 0.1, 0.0])))
     assert np.all(right < 0.2 * wrong)
     away = misfits(lidar, mounting, FIRST, SECOND, exact + np.array([90.0, 0.0, 0.0]))
@@ -55,9 +57,10 @@ def test_along_a_bare_corridor_a_scan_matches_the_next_one_no_better_if_the_robo
 def test_scans_that_see_nothing_match_nothing():
     lidar, exact = seen(range_max=0.1)
     assert not np.isfinite(lidar.ranges).any()
-    found, share = scan_steps(lidar, NOMINAL, FIRST, SECOND, exact)
+    found, share, information = scan_steps(lidar, NOMINAL, FIRST, SECOND, exact)
     np.testing.assert_allclose(found, exact)
     assert not share.any()
+    assert np.abs(information).max() < 1e-9
     assert not misfits(lidar, NOMINAL, FIRST, SECOND, exact).any()
 
 

@@ -16,6 +16,11 @@ from uwblite.screening.wheel_motion import Pairs, compare
 from uwblite.sensor_log import Odometry, SensorLog, SensorMounting
 
 
+def alike(count):
+    """Return the same information for each of so many pairs (count, 3, 3)."""
+    return np.tile(np.eye(3), (count, 1, 1))
+
+
 def pairs_of_a_laser_turned_by(angle: float, stuck: float) -> Pairs:
     """Ways of 0.12 m and small turns; of a share of the pairs, along bare walls, the lidar repeats what the wheels said."""
     rng, count = np.random.default_rng(3), 200
@@ -24,7 +29,7 @@ def pairs_of_a_laser_turned_by(angle: float, stuck: float) -> Pairs:
     lidar[:, :2] += rng.normal(0.0, 0.004, (count, 2))
     kept = rng.permutation(count) < stuck * count
     lidar[kept] = wheels[kept]
-    return Pairs(np.arange(count) * 1.0, np.arange(count) + 0.3, lidar, wheels, np.ones(count))
+    return Pairs(np.arange(count) * 1.0, np.arange(count) + 0.3, lidar, wheels, np.ones(count), alike(count))
 
 
 @pytest.mark.parametrize("angle", [np.pi, np.pi / 2, -np.pi / 2, 0.5])
@@ -74,7 +79,8 @@ def test_turns_show_whether_the_laser_or_the_way_of_driving_is_turned(angle, aro
     laser = se2.compose(se2.compose(se2.inverse(mount), wheels), mount)
     lidar = se2.compose(se2.compose(given, laser), se2.inverse(given))
     log = SensorLog(Odometry(np.arange(3.0), np.zeros((3, 3))), mounting=SensorMounting(given, tag_position=tag))
-    done, facts = laser_ahead(log, Pairs(np.arange(count) * 1.0, np.arange(count) + 0.3, lidar, wheels, np.ones(count)))
+    start = np.arange(count) * 1.0
+    done, facts = laser_ahead(log, Pairs(start, start + 0.3, lidar, wheels, np.ones(count), alike(count)))
     (remark,) = told(facts)
     # The median direction over turns, at which the lever arm shows itself, is known to some hundredths.
     np.testing.assert_allclose(done.mounting.T_base_laser[:2], mount[:2], atol=0.02)

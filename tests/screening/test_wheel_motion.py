@@ -133,7 +133,7 @@ def test_pairs_that_match_poorly_from_the_wheels_are_matched_from_rest_too(monke
         asked.append(len(first))
         by_wheels = len(asked) == 1
         share = np.tile([0.9, 0.8, 0.8], len(first))[: len(first)] if by_wheels else np.resize(at_rest, len(first))
-        return guess + (1.0 if by_wheels else 7.0), share
+        return guess + (1.0 if by_wheels else 7.0), share, np.zeros((len(share), 3, 3))
 
     monkeypatch.setattr(wheel_motion, "scan_steps", steps)
     monkeypatch.setattr(wheel_motion, "_fit_better", lambda log, first, *_: np.ones(len(first), dtype=bool))
@@ -144,10 +144,16 @@ def test_pairs_that_match_poorly_from_the_wheels_are_matched_from_rest_too(monke
     assert np.all((found.lidar[:, 1] == 7.0) == (np.arange(count) % 3 == 2))
 
 
+def alike(count, size):
+    """Return the same information for each motion (count, size)."""
+    return np.tile(np.eye(size), (count, 1, 1))
+
+
 def pairs(count=100, way=0.1, turn=0.0, **more):
     wheels = np.column_stack([np.full(count, way), np.zeros(count), np.full(count, turn)])
     start = np.arange(float(count))
     given = {"start": start, "end": start + 0.5, "lidar": wheels.copy(), "wheels": wheels, "share": np.ones(count)}
+    given["information"] = alike(count, 3)
     return Pairs(**{**given, **more})
 
 
@@ -167,6 +173,21 @@ def test_the_way_ratio_is_of_measured_pairs_with_a_clear_way():
     found.wheels[10:15, 0] = 0.05
     assert found.way_ratio == pytest.approx(1.1)
     assert np.isnan(found.rows(np.arange(40) < 20).way_ratio)
+
+
+@pytest.mark.filterwarnings("error")
+def test_pairs_whose_scans_do_not_measure_the_way_have_no_part_in_its_ratio():
+    """Along a wall a match stays at the wheels' guess, whatever the lidar's scale; where only the turn is known as well."""
+    found = pairs(80)
+    found.information[:40] = np.diag([0.0, 1.0, 1.0])
+    found.information[20:40, 0, 0] = found.information[20:40, 0, 2] = found.information[20:40, 2, 0] = 1.0
+    found.lidar[40:, 0] *= 1.2
+    assert found.way_ratio == pytest.approx(1.2)
+    found.information[40:50] *= 1e-3
+    found.lidar[40:50, 0] = 0.01
+    assert found.way_ratio == pytest.approx(1.2)
+    found.information[:] = 0.0
+    assert np.isnan(found.way_ratio)
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.5])
@@ -349,9 +370,9 @@ def test_the_factor_is_the_median_of_those_along_the_wheels_of_clear_motions():
     clear = np.flatnonzero(np.hypot(*wheels.T) > 0.08)
     # The factor by which the wheels' motion comes nearest to the lidar's.
     nearest = [np.linalg.lstsq(wheels[k, :, None], lidar[k], rcond=None)[0][0] for k in clear]
-    assert times_as_large(lidar, wheels, 0.08) == pytest.approx(np.median(nearest))
-    assert times_as_large(lidar[clear][:12], wheels[clear][:12], 0.0) == pytest.approx(np.median(nearest[:12]))
-    assert np.isnan(times_as_large(lidar[:11], wheels[:11], 0.0))
+    assert times_as_large(lidar, wheels, 0.08, alike(50, 2)) == pytest.approx(np.median(nearest))
+    assert times_as_large(lidar[clear][:12], wheels[clear][:12], 0.0, alike(12, 2)) == pytest.approx(np.median(nearest[:12]))
+    assert np.isnan(times_as_large(lidar[:11], wheels[:11], 0.0, alike(11, 2)))
 
 
 def test_noise_of_turns_that_are_chosen_by_it_makes_no_factor():
@@ -360,9 +381,9 @@ def test_noise_of_turns_that_are_chosen_by_it_makes_no_factor():
     wheels, lidar = rng.normal(0.0, 0.012, (4000, 1)), rng.normal(0.0, 0.001, (4000, 1))
     true = 0.5 * (np.arange(4000) % 100 == 0)[:, None]
     wheels, lidar = wheels + true, lidar + true
-    assert times_as_large(lidar, wheels, 0.03) < 0.2
-    assert abs(lidar_by_wheels(wheels, lidar, 0.03, 1.0) - 1.0) < 0.02
-    assert lidar_by_wheels(wheels[:5], lidar[:5], 0.0, 7.0) == 7.0
+    assert times_as_large(lidar, wheels, 0.03, alike(4000, 1)) < 0.2
+    assert abs(lidar_by_wheels(wheels, lidar, 0.03, 1.0, alike(4000, 1)) - 1.0) < 0.02
+    assert lidar_by_wheels(wheels[:5], lidar[:5], 0.0, 7.0, alike(5, 1)) == 7.0
 
 
 STILL = (20.0, 30.0)
@@ -393,7 +414,7 @@ def exact_scans(monkeypatch):
 
     def steps(scans, mounting, first, second, guess, searches=0):
         at = [se2.interpolate_trajectory(stamps, truth, scans.middles[k]) for k in (first, second)]
-        return se2.between(*at), np.where(np.isin(np.arange(len(first)), [5, 6]), 0.4, 0.9)
+        return se2.between(*at), np.where(np.isin(np.arange(len(first)), [5, 6]), 0.4, 0.9), np.zeros((len(first), 3, 3))
 
     monkeypatch.setattr(wheel_motion, "scan_steps", steps)
 
@@ -450,7 +471,7 @@ def test_steps_that_scans_do_not_show_go_on_as_before_and_after(monkeypatch):
     one[10], share[10] = [0.0, 0.4, 0.0], 0.5
     other, better = usual + np.array([0.0, 0.0, 0.001]), np.full(12, 0.78)
     better[[3, 6, 8, 10]] = 0.2, 0.2, 0.76, 0.75
-    guesses, answers = [], iter([(one, share), (other, better)])
+    guesses, answers = [], iter([(one, share, None), (other, better, None)])
 
     def steps(scans, mounting, first, second, guess, searches=0):
         guesses.append(guess)

@@ -9,17 +9,14 @@ from functools import partial
 
 import numpy as np
 
-from .. import se2
 from ..arrays import Floats
 from ..findings import WHEELS_AGAINST_LIDAR, Finding, doubt, kinds, warning
 from ..graph.calibration import HEIGHT, RANGE_SCALE, Unknown
-from ..graph.graph import Graph, PriorEdges, UnknownKey
+from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..pipeline.estimate import Estimate, Task
-from ..pipeline.recordings import Recording
 from ..screening.units import likely_unit
-from ..screening.wheel_motion import PairPolicy, lidar_by_wheels
 from ..sensor_log.sensors import name_and_number
 from .causes import explained
 from .certainty import check_certainty, check_drifts, check_other_side
@@ -224,13 +221,14 @@ def check_lengths(estimate: Estimate, task: Task) -> Iterator[Finding]:
     The map has the lidar's lengths, and without one those of the radio, which measures times of flight. What lidar and wheels
     measured is compared as it was before a calibration could take that up: no residual shows it.
     """
-    graph, calibration = estimate.graph, estimate.graph.calibration
+    calibration = estimate.graph.calibration
     place = calibration.index(RANGE_SCALE)
     error = float(calibration.values[place]) if place >= 0 and estimate.placed.any() else 0.0
     if abs(error) > _OTHER_LENGTH:
         text = f"the ranges are {1.0 + error:.2f} times the distances on the map: {_RADIO_OR_WHEELS}{likely_unit(1.0 + error)}"
         yield doubt("scales", text, range_scale=1.0 + error)
-    ratios = np.array([_lidar_by_wheels(recording, graph) for recording in task.recordings.each])
+    screened = (recording.log.screening for recording in task.recordings.each)
+    ratios = np.array([screening.lidar_by_wheels for screening in screened if screening is not None])
     off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > _OTHER_LENGTH)]
     if len(off):
         text = (
@@ -238,20 +236,6 @@ def check_lengths(estimate: Estimate, task: Task) -> Iterator[Finding]:
             "check the units of both"
         )
         yield doubt("scales", text, lidar_by_wheels=float(off[0]))
-
-
-def _lidar_by_wheels(recording: Recording, graph: Graph) -> float:
-    """Return how many times as long as by the wheels the way is by the lidar; nan where single scans do not compare them.
-
-    Of the ratio by pairs of scans and that by the map's steps, the one that is nearer to 1: where scans show little, all pairs
-    have one error in common.
-    """
-    screening = recording.log.screening
-    if screening is None or np.isnan(screening.lidar_by_wheels):
-        return float("nan")
-    wheels, path = (se2.between(p[:-1], p[1:])[:, :2] for p in (recording.frames.odometry, graph.poses[recording.rows]))
-    by_path = lidar_by_wheels(wheels, path, PairPolicy.clear, screening.lidar_by_wheels)
-    return min(screening.lidar_by_wheels, by_path, key=lambda ratio: abs(ratio - 1.0))
 
 
 def check_handedness(estimate: Estimate, task: Task) -> Iterator[Finding]:

@@ -16,7 +16,7 @@ from . import clouds, scan_matching
 from .cloud_rasters import CloudRasters, rasterize
 from .clouds import CLOUDS_AT_ONCE, CloudConfig, Clouds
 from .correlative_matching import search
-from .scan_matching import CloudPairs, PairPolicy, align_pairs, pairs_of
+from .scan_matching import CloudPairs, PairPolicy, align_pairs, measured_part, pairs_of
 from .visibility import directional_overlap, free_around, violates_free_space
 
 
@@ -37,7 +37,7 @@ class ScanStepPolicy:
 
 def scan_steps(
     scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, guess: Floats, searches: int = 0
-) -> tuple[Floats, Floats]:
+) -> tuple[Floats, Floats, Floats]:
     """Measure the motion of the base between pairs of scans.
 
     Unobservable directions (along a bare corridor) keep the guess.
@@ -49,9 +49,10 @@ def scan_steps(
 
     Returns
     -------
-    Motions T_first_second (e, 3) and the share of points that match (e,), 0..1; 0 where there are too few.
+    Motions T_first_second (e, 3), the share of points that match (e,), 0..1; 0 where there are too few; and the information
+    (e, 3, 3) that a descent from the guess gives about the motion, unscaled by noise, none in directions that nothing measures.
     """
-    steps, shares = [np.zeros_like(guess[:0])], [np.zeros(0)]
+    steps, shares, information = [np.zeros_like(guess[:0])], [np.zeros(0)], [np.zeros((0, *2 * se2.POSE))]
     for rows in chunks(len(first), CLOUDS_AT_ONCE):
         raster, pairs = _pairs(*_clouds(scans, mounting, first[rows], second[rows]))
         aligned = align_pairs(raster, pairs, guess[rows], ScanStepPolicy.reach, ScanStepPolicy.gate)
@@ -65,7 +66,8 @@ def scan_steps(
                 pose[row], share[row] = found
         steps.append(pose)
         shares.append(share)
-    return np.concatenate(steps), np.concatenate(shares)
+        information.append(measured_part(*aligned.factors.quadratic)[0])
+    return np.concatenate(steps), np.concatenate(shares), np.concatenate(information)
 
 
 def misfits(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:

@@ -163,7 +163,7 @@ def with_late_scans_placed(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
         return log, []
     times, rows = scans.middles, np.arange(len(scans.stamps) - 1)
     wheels = log.odometry.motion(times[:-1], times[1:])
-    steps, share = scan_steps(scans, log.mounting, rows, rows + 1, wheels)
+    steps, share, _ = scan_steps(scans, log.mounting, rows, rows + 1, wheels)
     steps = np.where((share >= PairPolicy.matching)[:, None], steps, wheels)
     late = 1 + np.flatnonzero(displaced(se2.between(wheels, steps)))
     if not len(late):

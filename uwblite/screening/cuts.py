@@ -210,4 +210,4 @@ def _matched(log: SensorLog, first: Ints, second: Ints) -> tuple[Floats, Floats]
     assert log.scans is not None
     middle = log.scans.middles
     guess = log.odometry.motion(middle[first], middle[second])
-    return scan_steps(log.scans, log.mounting, first, second, guess, searches=len(first))
+    return scan_steps(log.scans, log.mounting, first, second, guess, searches=len(first))[:2]

@@ -75,24 +75,31 @@ _PARTS = slice(0, 2), slice(2, None)
 """Ways and turns of motions."""
 
 
-def times_as_large(others: Floats, motions: Floats, clear: float) -> float:
-    """Return how many times as large as motions (e, d) others of the same times (e, d) are, in the median over clear motions;
-    nan where there are too few."""
-    size = np.sqrt(np.sum(motions**2, axis=1))
-    rows = size > clear
-    ratio = np.sum(motions * others, axis=1)[rows] / size[rows] ** 2
-    return float(np.median(ratio)) if len(ratio) >= PairPolicy.enough else _NAN
+def times_as_large(others: Floats, motions: Floats, clear: float, information: Floats) -> float:
+    """Return how many times as large as motions (e, d) others of the same times (e, d) are, in the median over clear motions.
+
+    Each counts by the information (e, d, d) about the motion in its direction; nan where too few show it beyond noise.
+    """
+    toward = np.einsum("ei,eij->ej", motions, information)
+    size, known = np.sum(motions**2, axis=1), np.sum(toward * motions, axis=1)
+    rows = np.flatnonzero((size > clear**2) & (known > PairPolicy.noise**2))
+    if len(rows) < PairPolicy.enough:
+        return _NAN
+    ratio, weight = np.sum(toward * others, axis=1)[rows] / known[rows], known[rows] / size[rows]
+    order = np.argsort(ratio)
+    total = np.cumsum(weight[order])
+    return float(np.interp(0.5 * total[-1], total - 0.5 * weight[order], ratio[order]))
 
 
-def lidar_by_wheels(wheels: Floats, lidar: Floats, clear: float, otherwise: float) -> float:
-    """Return how many times as large as the wheels' motions (e, d) the lidar's are.
+def lidar_by_wheels(wheels: Floats, lidar: Floats, clear: float, otherwise: float, information: Floats) -> float:
+    """Return how many times as large as the wheels' motions (e, d) the lidar's are; information (e, d, d) is the lidar's.
 
     It is `otherwise` where too few are clear, or most are opposite.
 
     Noise of one sensor, such as rounding, draws the ratio to its own motions down (regression dilution). So the ratio to the
     other's motions is taken as well, and of both the one that is nearer to 1.
     """
-    ratio, inverse = times_as_large(lidar, wheels, clear), times_as_large(wheels, lidar, clear)
+    ratio, inverse = (times_as_large(*pair, clear, information) for pair in ((lidar, wheels), (wheels, lidar)))
     if not (ratio > 0.0 and inverse > 0.0):
         return ratio if ratio > 0.0 else otherwise
     return min(ratio, 1.0 / inverse, key=lambda value: abs(np.log(value)))
@@ -143,6 +150,8 @@ class Pairs(Table):
     """(e, 3)."""
     share: Floats
     """(e,) of points that match."""
+    information: Floats
+    """(e, 3, 3) about the motion by the lidar, see scan_steps."""
 
     @property
     def measured(self) -> Bools:
@@ -163,14 +172,20 @@ class Pairs(Table):
     @property
     def scaled(self) -> Floats:
         """(e, 3) motion by wheels, one factor for all ways and one for all turns taken out."""
-        factors = [lidar_by_wheels(self.wheels[:, p], self.lidar[:, p], PairPolicy.moving, 1.0) for p in _PARTS]
+        factors = [self._lidar_by_wheels(part, PairPolicy.moving, 1.0) for part in _PARTS]
         return self.wheels * np.repeat(factors, [2, 1])
 
     @property
     def way_ratio(self) -> float:
         """The way by the lidar / the way by the wheels; nan where there are too few clear motions."""
-        own = self.rows(self.measured)
-        return _NAN if self.unrelated else lidar_by_wheels(own.wheels[:, :2], own.lidar[:, :2], PairPolicy.clear, _NAN)
+        return _NAN if self.unrelated else self.rows(self.measured)._lidar_by_wheels(_PARTS[0], PairPolicy.clear, _NAN)
+
+    def _lidar_by_wheels(self, part: slice, clear: float, otherwise: float) -> float:
+        """Return how many times as large as the wheels' the ways or turns by the lidar are; see lidar_by_wheels."""
+        rest = np.delete(np.arange(3), part)
+        of_part, cross, of_rest = (self.information[:, i][:, :, k] for i, k in ((part, part), (part, rest), (rest, rest)))
+        known = of_part - cross @ np.linalg.pinv(of_rest, hermitian=True) @ np.swapaxes(cross, 1, 2)
+        return lidar_by_wheels(self.wheels[:, part], self.lidar[:, part], clear, otherwise, known)
 
 
 def standing(odometry: Odometry, least: float = PairPolicy.least_stand) -> list[tuple[float, float]]:
@@ -201,14 +216,14 @@ def compare(log: SensorLog) -> Pairs | None:
     if not len(first):
         return None
     wheels = log.odometry.motion(middle[first], middle[second])
-    by_wheels, good = scan_steps(scans, log.mounting, first, second, wheels)
+    by_wheels, good, information = scan_steps(scans, log.mounting, first, second, wheels)
     # Pairs that match so well from the wheels' guess are not also matched from zero motion.
     poor = np.flatnonzero(good < MOST)
-    by_rest, rest = scan_steps(scans, log.mounting, first[poor], second[poor], 0.0 * wheels[poor])
+    by_rest, rest, of_rest = scan_steps(scans, log.mounting, first[poor], second[poor], 0.0 * wheels[poor])
     better = rest > good[poor] + PairPolicy.gain
     better[better] = _fit_better(log, first[poor[better]], second[poor[better]], by_rest[better], by_wheels[poor[better]])
-    by_wheels[poor[better]], good[poor[better]] = by_rest[better], rest[better]
-    return Pairs(middle[first], middle[second], by_wheels, wheels, good)
+    by_wheels[poor[better]], good[poor[better]], information[poor[better]] = by_rest[better], rest[better], of_rest[better]
+    return Pairs(middle[first], middle[second], by_wheels, wheels, good, information)
 
 
 def _fit_better(log: SensorLog, first: Ints, second: Ints, one: Floats, other: Floats) -> Bools:
@@ -375,11 +390,11 @@ def _smooth_steps(log: SensorLog, chosen: Ints) -> Floats:
     """
     assert log.scans is not None
     first, second = chosen[:-1], chosen[1:]
-    steps, share = scan_steps(log.scans, log.mounting, first, second, np.zeros((len(first), 3)), PairPolicy.searches)
+    steps, share, _ = scan_steps(log.scans, log.mounting, first, second, np.zeros((len(first), 3)), PairPolicy.searches)
     half = PairPolicy.lasting // 2
     padded = np.pad(steps, ((half, half), (0, 0)), mode="edge")
     usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0), axis=2)
-    again, better = scan_steps(log.scans, log.mounting, first, second, usual)
+    again, better, _ = scan_steps(log.scans, log.mounting, first, second, usual)
     taken = np.where((better >= share - PairPolicy.gain)[:, None], again, steps)
     # No step is longer than a metre: that is 4 m/s.
     matched = (np.maximum(share, better) >= 0.5) & (np.hypot(taken[:, 0], taken[:, 1]) <= 1.0)
