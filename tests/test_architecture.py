@@ -230,12 +230,14 @@ def findings_made_elsewhere(module):
 
 def records_by_value(module):
     """Records with arrays, which have no one truth when they are compared, are compared by identity, and so are those that hold
-    such records; records do not change, but for a few that count or collect."""
+    such records; records do not change, but for a few that count or collect, and have no fields but their own."""
     for name, held, options in records_of(module):
         if options.get("eq") != "False" and held & with_arrays():
             yield f"{module} {name} compares arrays: eq=False"
         if options.get("frozen") != "True" and name not in COLLECTING:
             yield f"{module} {name} can be changed: frozen=True"
+        if options.get("slots") != "True":
+            yield f"{module} {name} takes fields that it has not, and more memory: slots=True"
 
 
 COLLECTING = (

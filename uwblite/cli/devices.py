@@ -17,7 +17,7 @@ LISTEN, ASK = 0.6, 5.0
 """s to wait for a device that talks unasked, and for one that answers."""
 
 
-@dataclass
+@dataclass(slots=True)
 class PortReport:
     path: str
     kind: str = "unknown"
