@@ -1,7 +1,10 @@
 """`uwblite optimize` on hard graphs: odometry that bends too far, false loop closures and ranges."""
 
 import json
+import re
+from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -146,6 +149,9 @@ def test_robust_names_the_false_ranges_and_leaves_them_out(tmp_path, capsys):
     edges[2] = replace(edges[2], ranges=edges[2].ranges + 4.0 * bad)
     path = written(tmp_path / "false.pyfg", replace(graph, edges=tuple(edges)))
     found = figures(capsys, path, "--robust", "--out", str(tmp_path / "out.pyfg"))
+    # What was left out is no property of the measurements: the file keeps them all.
+    before, after = (Counter(re.findall(r"^EDGE_\w+", Path(name).read_text(), re.M)) for name in (path, tmp_path / "out.pyfg"))
+    assert before == after
     # One good range in a thousand lies beyond the threshold.
     assert bad.sum() <= found["outliers"]["RangeEdges"] <= bad.sum() + 5
     assert found["chi2_per_dof"] == pytest.approx(1.0, abs=0.2)
