@@ -296,8 +296,9 @@ def test_a_file_reports_it_all():
     ],
 )
 def test_a_wrong_file_is_named(text, message):
-    with pytest.raises(ConfigError, match=message):
-        parse_constraints(text, "known.toml")
+    for path, named in (("", "constraints"), ("known.toml", "known.toml")):
+        with pytest.raises(ConfigError, match=f"^{named}: .*{message}"):
+            parse_constraints(text, path)
 
 
 def test_the_anchors_of_an_earlier_map(tmp_path):

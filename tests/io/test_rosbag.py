@@ -199,10 +199,14 @@ def test_mappings_are_read_strictly():
         ("[uwb]\ntopic = 'x'", "uwb"),
         ("x = 1", "uwb"),
         ('[[uwb]]\nanchor_format = "{:q}"', "not valid"),
+        ('[[uwb]]\nanchor_format = "{:09999}"', "is not text around one"),
+        ('[[uwb]]\nanchor_format = "{0.real}"', "is not text around one"),
         ('[[uwb]]\nanchor = "topic:("', "not valid"),
+        ("[[uwb]", "not valid TOML"),
     ):
-        with pytest.raises(ConfigError, match=message):
-            parse_mappings(wrong)
+        for path, named in (("", "uwb mapping"), ("u.toml", "u.toml")):
+            with pytest.raises(ConfigError, match=f"^{named}: .*{message}"):
+                parse_mappings(wrong, path)
 
 
 def test_an_id_with_blanks_stays_one_word():

@@ -35,14 +35,15 @@ def read_constraints(path: str | None, anchors_from: str | None) -> Constraints:
 
 def parse_constraints(text: str, path: str = "") -> Constraints:
     """Return the constraints of a TOML text, tables with the fields of their classes; path is its name for error messages."""
+    path = path or "constraints"
     data = parse_toml(text, path)
     entries: dict[str, tuple[Any, ...]] = {}
     for name, tables in data.items():
         if name not in _TABLES or not isinstance(tables, list):
             tables_known = ", ".join(f"[[{k}]]" for k in _TABLES)
-            raise ConfigError(f"{path or 'constraints'}: unknown table {name!r}; it may hold {tables_known}")
+            raise ConfigError(f"{path}: unknown table {name!r}; it may hold {tables_known}")
         kind, field, needed = _TABLES[name]
-        where = f"{path or 'constraints'}: [[{name}]] number"
+        where = f"{path}: [[{name}]] number"
         entries[field] = tuple(_entry(kind, needed, table, f"{where} {k}") for k, table in enumerate(tables, 1))
     return Constraints(**entries)
 

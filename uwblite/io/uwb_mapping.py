@@ -161,26 +161,30 @@ def fitting(topic: str, message_type: str, table: Sequence[UwbMapping]) -> tuple
 
 def parse_mappings(text: str, path: str = "") -> tuple[UwbMapping, ...]:
     """Return the mappings of a TOML text; path is its name for error messages."""
+    path = path or "uwb mapping"
     data = parse_toml(text, path)
     tables = data.get("uwb")
     if set(data) - {"uwb"} or not isinstance(tables, list) or not tables:
-        raise ConfigError(f"{path or 'uwb mapping'}: it must hold [[uwb]] tables and nothing else")
-    return tuple(_checked(from_dict(UwbMapping, table), path) for table in tables)
+        raise ConfigError(f"{path}: it must hold [[uwb]] tables and nothing else")
+    try:
+        return tuple(_checked(from_dict(UwbMapping, table)) for table in tables)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
 
 
 _PLAIN_FORMAT = re.compile(r"[^{}]{0,40}\{(:[#0]*[0-9]{0,2}[a-zA-Z]?)?\}[^{}]{0,40}")
 """No attributes, and no widths that fill the memory."""
 
 
-def _checked(mapping: UwbMapping, path: str) -> UwbMapping:
+def _checked(mapping: UwbMapping) -> UwbMapping:
     if not _PLAIN_FORMAT.fullmatch(mapping.anchor_format):
         wrong = mapping.anchor_format[:40]
-        raise ConfigError(f"{path}: anchor_format {wrong!r} is not text around one '{{}}' or such as '{{:04X}}'")
+        raise ConfigError(f"anchor_format {wrong!r} is not text around one '{{}}' or such as '{{:04X}}'")
     try:
         mapping.anchor_format.format(0)
         re.compile(mapping.anchor)
     except (ValueError, IndexError, KeyError, re.error) as error:
-        raise ConfigError(f"{path}: anchor or anchor_format of a uwb mapping is not valid: {error}") from None
+        raise ConfigError(f"anchor or anchor_format of a uwb mapping is not valid: {error}") from None
     return mapping
 
 
