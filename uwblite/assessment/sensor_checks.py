@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import BEYOND_NOISE, Floats, white_noise
+from ..arrays import BEYOND_NOISE, CHUNK, Floats, chunks, white_noise
 from ..findings import NOTE, WARNING, Finding
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..screening.repeats import RepeatPolicy
@@ -258,13 +258,16 @@ def lidar_figures(log: SensorLog) -> Figures:
     """Return rhythm, field of view, and shares of beams of the scans."""
     scans = log.scans
     assert scans is not None
-    readings, beams = scans.ranges.size, scans.ranges.shape[1]
+    beams, kinds = scans.ranges.shape[1], ("share of beams that hit", "share that saw nothing", "share that is invalid")
+    counts = np.zeros(len(kinds))
+    for rows in chunks(len(scans.ranges), max(CHUNK // beams, 1)):
+        some = scans.ranges[rows]
+        counts += [np.count_nonzero(kind) for kind in (scans.hits(some), some == np.inf, np.isnan(some))]
+    shares = (counts / scans.ranges.size).tolist()
     figures = {
         "field of view deg": np.degrees(abs(scans.angle_increment) * (beams - 1)),
         "range max m": scans.range_max,
-        "share of beams that hit": np.count_nonzero(scans.hits(scans.ranges)) / readings,
-        "share that saw nothing": np.count_nonzero(scans.ranges == np.inf) / readings,
-        "share that is invalid": np.count_nonzero(np.isnan(scans.ranges)) / readings,
+        **dict(zip(kinds, shares, strict=True)),
     }
     return rhythm(scans.stamps, expected_gap=1.0) | {"beams": beams} | _rounded(figures)
 
