@@ -15,7 +15,7 @@ from .. import se2
 from ..arrays import OUTLIER, TINY, Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
-from ..odometry.slips import covariance_of, lost_sigma, posterior, slip_sigma, with_slips
+from ..odometry.slips import covariance_of, lost_sigma, posterior, spin_sigma, with_slips
 from ..odometry.wheels import displaced, reestimate_wheel_noise, stamp_jitter
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
@@ -140,7 +140,7 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
     # The stamps of both scans err.
     by_stamps = np.sqrt(2.0) * stamp_jitter(wheels, certain, graph) * mean / np.maximum(noise.duration, TINY)[:, None]
     covariance = covariance_of(noise, graph) + by_stamps[:, :, None] * by_stamps[:, None, :]
-    prior = Prior.about(mean, covariance, slip_sigma(noise), lost_sigma(noise))
+    prior = Prior.about(mean, covariance, spin_sigma(noise), lost_sigma(noise))
     found = register(objects, pairs, prior, steps.pose)
     # Where ranges are few, the path follows the wheels: that no slip shows there is no evidence against one.
     by_others = 0.0 if wheels.slips is None else of_fallible(np.maximum(logit(wheels.slips), 0.0), RegistrationConfig.useless)

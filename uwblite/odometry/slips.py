@@ -18,6 +18,8 @@ EVERY, LASTS = 600.0, 2.0
 SPEED, TURN_RATE = 0.5, 0.5
 """Standard deviations of the motion that wheels do not count while they slip, m/s and rad/s: a robot is pushed as fast as
 people walk. They count at most all of their motion too much."""
+ASIDE = 0.1
+"""Uncounted motion across wheels that spin, as a share of that along them: they have hold of the ground to the side."""
 STEADY = 10.0
 """Time over which the false motion of a slip changes, s: while wheels spin, the robot's speed is as commanded."""
 _SHARE = LASTS / (EVERY + LASTS)
@@ -30,6 +32,13 @@ def slip_sigma(wheels: OdometryEdges) -> Floats:
     """Return the standard deviation (e, 3) of steps of the odometry over which the wheels slip, m, m, rad."""
     # A slip does not last as long as a pause.
     return _uncounted(wheels, -LASTS * np.expm1(-wheels.duration / LASTS))
+
+
+def spin_sigma(wheels: OdometryEdges) -> Floats:
+    """Return the same (e, 3) where wheels spin and nothing pushes the robot to the side."""
+    sigma = slip_sigma(wheels)
+    sigma[:, 1] = np.abs(wheels.motion[:, 1]) + ASIDE * sigma[:, 0]
+    return sigma
 
 
 def lost_sigma(wheels: OdometryEdges) -> Floats:
