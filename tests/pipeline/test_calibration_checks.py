@@ -247,7 +247,7 @@ def test_wheels_whose_ways_a_lidar_measures_are_in_metres_whatever_the_ranges_sa
     logs = [log_of(STANDING, MOMENTS, screening=screened(way)) for way in ways]
     config = MappingConfig()
     found = with_units_checked(config, logs)
-    assert (found.calibration.odometry_unit <= found.calibration.odometry_scale) == checked
+    assert (found.calibration.odometry_unit < 0.15) == checked
     assert replace(found, calibration=config.calibration) == config
     if not checked:
         assert found is config

@@ -19,7 +19,7 @@ from uwblite.pipeline.estimate import Estimate, Task
 from uwblite.pipeline.lidar_stages import refine_jointly
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.radio_stages import evidence_against, first_optimisation, reestimate_ranges, select_range_priors
+from uwblite.pipeline.radio_stages import evidence_against, first_optimisation, reestimate_ranges
 from uwblite.pipeline.recordings import gather
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.sensor_log import SensorLog, SensorMounting
@@ -32,7 +32,6 @@ def test_next_to_no_matched_scans_hold_no_path_and_are_not_refined():
     assert few.held_by_scans.tolist() == [True, True] + [False] * (len(graph.poses) - 2)
     assert (few.rests_on_ranges, replace(few, ranges=None).rests_on_ranges) == (True, False)
     assert refine_jointly(few, None) is few
-    assert select_range_priors(replace(few, ranges=None), None).graph is graph
 
 
 @pytest.mark.parametrize(("growth", "gone"), [

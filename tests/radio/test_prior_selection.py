@@ -11,6 +11,7 @@ from uwblite.errors import SolverError
 from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unknowns
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.marginals import calibration_covariance
+from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
 from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
@@ -163,6 +164,27 @@ def test_the_likeliest_unit_of_length_is_the_wrong_one(scale, unit, wide):
         assert found["range_scale"] < 0.01
     expected = CONFIG.odometry_unit if wide == "odometry_scale" else CONFIG.odometry_scale
     assert found["odometry_scale"] == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize(("count", "wide"), [(1.0, False), (1.03, False), (0.91, True), (1.1, True)])
+def test_without_ranges_wheels_that_a_lidar_finds_far_off_get_a_wide_prior(count, wide):
+    """Of 50 m, each metre is measured to 5 cm; nothing is said of a radio."""
+    rng = np.random.default_rng(3)
+    ahead = np.tile([1.0, 0.0, 0.0], (50, 1))
+    stamps, truth = np.arange(51.0), np.column_stack([np.arange(51.0), np.zeros((51, 2))])
+    wheels, way = Odometry(stamps, truth * count), replace(CONFIG, odometry_unit=0.12)
+    listed = unknowns(way, ("A", "B"), np.ones(2, dtype=bool))
+    steps = wheel_edges(select(wheels, KeyframeConfig(distance=1.0)), OdometryNoiseConfig(), block(listed))
+    first = np.arange(len(steps.i))
+    seen = ahead[first] + rng.standard_normal((len(first), 3)) * np.array([0.05, 0.05, 0.01])
+    lidar = RelativePoseEdges(first, first + 1, seen, np.tile(np.diag([20.0, 20.0, 100.0]), (len(first), 1, 1)))
+    constant = np.array([u.key.kind != "odometry_scale" for u in listed])
+    graph = Graph(truth[: len(first) + 1], np.zeros((2, 2)), (prior_edges(listed),), block(listed), fixed_calibration=constant)
+    done = optimize(graph.with_edges(lidar, steps))[0]
+    before = graph.updated(done.poses, done.anchors, done.calibration.values)
+    after = widths(select_priors(before, (lidar, steps), way))
+    assert after["odometry_scale"] == pytest.approx(way.odometry_unit if wide else way.odometry_scale)
+    assert {name for name in after if after[name] != widths(before)[name]} == ({"odometry_scale"} if wide else set())
 
 
 @pytest.mark.parametrize(("wheels", "wrong"), [(0, []), (1, [[1]]), (2, [[1, 0], [0, 1], [1, 1]])])

@@ -92,7 +92,7 @@ def with_slip_in_turns(estimate: Estimate, task: Task) -> Estimate:
 
 
 def with_units_checked(config: MappingConfig, logs: Sequence[SensorLog]) -> MappingConfig:
-    """Return the settings without the hypothesis that a unit of the wheels is wrong, where a lidar has measured their ways.
+    """Return the settings under which wheels are off by no more than a worn tyre is, where a lidar has measured their ways.
 
     Ranges through walls may fit wheels several times too short better than a path that is right; lidar and wheels that agree
     would both have to be wrong, by one factor. With recordings of which some show nothing, it stays.
@@ -101,7 +101,7 @@ def with_units_checked(config: MappingConfig, logs: Sequence[SensorLog]) -> Mapp
     if not np.all(np.abs(ways - 1.0) <= _OTHER_UNIT):
         return config
     priors = config.calibration
-    return replace(config, calibration=replace(priors, odometry_unit=min(priors.odometry_unit, priors.odometry_scale)))
+    return replace(config, calibration=replace(priors, odometry_unit=min(priors.odometry_unit, _OTHER_UNIT)))
 
 
 def without_known_calibration(config: MappingConfig, logs: Sequence[SensorLog]) -> MappingConfig:

@@ -216,15 +216,13 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     return estimate
 
 
-def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
-    """Re-estimate the ranges' noise on the trajectory with loops closed, and the priors of their systematic errors.
+def select_priors(estimate: Estimate, task: Task) -> Estimate:
+    """Re-estimate the ranges' noise on the trajectory with loops closed, and the priors of units and of ranges' systematic errors.
 
     Ranges have little weight meanwhile, so that sustained outliers of an anchor show in its residuals, unless ranges alone
     constrain the poses.
     """
-    if estimate.ranges is None:
-        return estimate
-    if estimate.steps is None or not estimate.rests_on_ranges:
+    if estimate.ranges is not None and (estimate.steps is None or not estimate.rests_on_ranges):
         weak = _learn_ranges(estimate, task, Optimizer(), steady=True)
         estimate = _learn_ranges(estimate, task, Optimizer()) if _let_go(estimate, weak, task.config.ranges) else weak
     return with_selected_priors(estimate, task.config)

@@ -4,8 +4,8 @@ Most radios are calibrated. A prior wide enough for those that are not (scales 7
 anchors and the map's scale undetermined, wherever bias and distance have the same effect along a path. So widths are chosen by
 marginal likelihood (I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992).
 
-A wheel's radius is a setting and can be wrong by any factor: of the hypotheses about the wheels' unit the likeliest one is
-taken. The scale and the biases of radios can be wrong by little or much: of several widths the mean (of the logarithms),
+A wheel's radius is a setting and can be wrong by any factor, or by a worn tyre's where a lidar has measured ways that are about
+as long: of the hypotheses about the wheels' unit the likeliest one is taken. The scale and the biases of radios can be wrong by little or much: of several widths the mean (of the logarithms),
 weighted by marginal likelihood, is taken, and the widest where a scale is clearly off.
 """
 
@@ -18,6 +18,7 @@ from ..errors import SolverError
 from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, CalibrationConfig
 from ..graph.graph import Edges, Graph
 from ..graph.marginals import calibration_covariance
+from ..graph.range_edges import RangeEdges
 from ..problem.alternatives import EvidencePolicy
 from ..problem.evidence import log_marginal_likelihood, prior_sigma, with_prior_sigma
 
@@ -62,10 +63,12 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
     edges : the measurements.
     config : the narrowest and widest priors.
     """
-    groups = [_free(graph, name) for name in ("range_scale", "odometry_scale", "bias")]
+    groups = [_free(graph, name) for name in (RANGE_SCALE, "odometry_scale", BIAS)]
+    if not any(isinstance(each, RangeEdges) for each in edges):
+        groups[0] = groups[2] = np.zeros(0, dtype=np.intp)
     which, radios, scales = np.concatenate(groups), len(groups[0]), len(groups[0]) + len(groups[1])
     sigma = prior_sigma(graph)
-    if not radios + len(groups[2]) or not np.all(np.isfinite(sigma[which])):
+    if not len(which) or not np.all(np.isfinite(sigma[which])):
         return graph
     try:
         covariance = calibration_covariance(graph.with_edges(*edges))[np.ix_(which, which)]
