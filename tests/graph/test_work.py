@@ -15,13 +15,13 @@ from uwblite.mapping import build_map
 USUAL = {
     "all sensors": {
         "factorisations": 113, "factor entries": 2_567_443, "products": 5_116_798, "points": 204_176,
-        "look-ups": 1_705_350, "rays": 749_090,
+        "look-ups": 1_806_290, "rays": 749_090,
     },
     "no lidar": {
         "factorisations": 53, "factor entries": 591_590, "products": 1_666_339,
     },
     "no ranges": {
-        "points": 206_865, "products": 1_150_538, "look-ups": 1_794_610, "factorisations": 44,
+        "points": 206_865, "products": 1_150_538, "look-ups": 1_968_690, "factorisations": 44,
         "factor entries": 1_271_737, "rays": 751_025,
     },
 }  # fmt: skip

@@ -217,7 +217,7 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
 
 
 def select_priors(estimate: Estimate, task: Task) -> Estimate:
-    """Re-estimate the ranges' noise on the trajectory with loops closed, and the priors of units and of ranges' systematic errors.
+    """Re-estimate the ranges' noise on the trajectory with loops closed, and the priors of units and systematic errors.
 
     Ranges have little weight meanwhile, so that sustained outliers of an anchor show in its residuals, unless ranges alone
     constrain the poses.
