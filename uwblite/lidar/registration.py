@@ -1,8 +1,9 @@
 """Registration: where a cloud lies in another one, given a prior that may be wrong altogether.
 
-The prior of a relative pose is a mixture of two Gaussians about one place: a narrow one, where the odometry holds, and one that
-is wide along the wheels and in heading, where they slipped (see ``Prior``). Matching descends from places throughout the prior, and
-both parts of the mixture are compared by their evidence, the marginal likelihood of the source's surfaces in the target by Laplace:
+The prior of a relative pose is a mixture of two Gaussians about one place: a narrow one, where the odometry holds, and one
+that is wide along the wheels and in heading, where they slipped (see ``Prior``). Matching descends from places throughout the
+prior, and both parts of the mixture are compared by their evidence, the marginal likelihood of the source's surfaces in the
+target by Laplace:
 
     log E = log N(T; mean, C) + sum over objects log((1 - m) exp(g - chi2 / 2) + m) + 3/2 log 2 pi - 1/2 log |H + C^-1|,
 

@@ -4,10 +4,10 @@ Most radios are calibrated. A prior wide enough for those that are not (scales 7
 anchors and the map's scale undetermined, wherever bias and distance have the same effect along a path. So widths are chosen by
 marginal likelihood (I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992).
 
-A wheel's radius is a setting and can be wrong by any factor, or by a worn tyre's where a lidar has measured ways that are about
-as long: of the hypotheses about the wheels' unit the likeliest one is taken. The scale and the biases of radios can be wrong by
-little or much: of several widths the mean (of the logarithms), weighted by marginal likelihood, is taken, and the widest where a
-scale is clearly off.
+A wheel's radius is a setting and can be wrong by any factor, or by a worn tyre's where a lidar has measured ways that are
+about as long: of the hypotheses about the wheels' unit the likeliest one is taken. The scale and the biases of radios can be
+wrong by little or much: of several widths the mean (of the logarithms), weighted by marginal likelihood, is taken, and the
+widest where a scale is clearly off.
 """
 
 from collections.abc import Sequence
