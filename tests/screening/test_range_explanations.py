@@ -8,6 +8,7 @@ import pytest
 from helpers import planted
 
 from uwblite import se2
+from uwblite.arrays import CHUNK
 from uwblite.screening.range_explanations import Stretches, _best_order, _best_place, _traces, explained_by_ranges
 from uwblite.sensor_log import Odometry, SensorLog
 
@@ -74,6 +75,21 @@ def test_readings_of_zero_have_no_antenna_delay():
     shifted, (fact,) = explained_by_ranges(replace(log, ranges=replace(log.ranges, ranges=ranges)))
     assert fact.kind == "antenna-delay"
     np.testing.assert_allclose(shifted.ranges.ranges, np.where(missed, 0.0, log.ranges.ranges), atol=0.5)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_reading_of_an_antenna_delay_itself_divides_by_nothing():
+    log = late_by(0.0)
+    ranges = np.where(np.arange(len(log.ranges.ranges)) == 9, 77.0, log.ranges.ranges)
+    assert explained_by_ranges(replace(log, ranges=replace(log.ranges, ranges=ranges)))[1] == []
+
+
+def test_rows_that_do_not_fit_in_a_cache_have_the_likelihoods_of_their_own():
+    rng = np.random.default_rng(0)
+    count = CHUNK // 8 + 50
+    paths, ranges = rng.normal(size=(count, 8, 2)), rng.uniform(1.0, 9.0, (count, 8))
+    whole, last = (_best_place(paths[k:], ranges[k:], np.ones((count - k, 8))) for k in (0, count - 60))
+    np.testing.assert_allclose(whole[:, -60:], last)
 
 
 def test_a_sound_recording_has_nothing_to_explain():
@@ -189,7 +205,7 @@ def test_the_likelihood_of_ranges_along_a_path_is_that_of_the_best_place():
     rng = np.random.default_rng(0)
     paths = rng.normal(size=(2, 30, 2)) * 3.0
     values = np.hypot(*(paths[0] - [7.0, -4.0]).T) + 0.05 * rng.standard_normal(30)
-    likely = _best_place(paths, values, np.ones(30))[1]
+    likely = _best_place(paths, np.stack([values, values]), np.ones((2, 30)))[1]
     around = np.stack(np.meshgrid(np.linspace(6.0, 8.0, 81), np.linspace(-5.0, -3.0, 81)), axis=-1).reshape(-1, 1, 2)
     errors = np.hypot(*np.moveaxis(paths[0] - around, -1, 0)) - values
     best = -np.log(np.pi * 0.2 * (1.0 + (errors / 0.2) ** 2)).sum(axis=1)

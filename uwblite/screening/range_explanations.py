@@ -504,13 +504,19 @@ def _best_order(pairs: Floats) -> Ints:
 def _best_place(paths: Floats, ranges: Floats, counted: Floats) -> Floats:
     """Return log likelihoods (g, ...) of ranges (..., n) along paths (..., n, 2) to one place each, for g scales of errors.
 
-    Counted (..., n) are 1 for a reading, and 0 where there is none. Squares of ranges are linear in the place and the square of
-    its distance from the middle of the path.
+    Counted (..., n) are 1 for a reading, and 0 where there is none. As many rows at a time as fit in a processor's cache.
     """
+    most = max(CHUNK // max(int(np.prod(paths.shape[1:-1])), 1), 1)
+    parts = [_best_place_of_few(paths[some], ranges[some], counted[some]) for some in chunks(max(len(paths), 1), most)]
+    return np.concatenate(parts, axis=1)
+
+
+def _best_place_of_few(paths: Floats, ranges: Floats, counted: Floats) -> Floats:
+    """Return the same; squares of ranges are linear in the place and the square of its distance from the middle of the path."""
     many = counted.sum(axis=-1)
     middle = (counted[..., None, :] @ paths)[..., 0, :] / many[..., None]
     x, y = (-2.0 * (paths[..., k] - middle[..., k, None]) for k in (0, 1))
-    squares, twice = ranges**2 - 0.25 * (x**2 + y**2), 2.0 * ranges
+    squares, twice = ranges**2 - 0.25 * (x**2 + y**2), 2.0 * np.maximum(np.abs(ranges), SHORTEST_RANGE)
     rows = np.stack([x, y, np.broadcast_to(1.0, x.shape), squares], axis=-2)
     unknown, sure = rows[..., :-1, :], counted / twice**2
     weights = np.broadcast_to(sure, squares.shape)
