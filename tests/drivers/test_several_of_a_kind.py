@@ -86,6 +86,12 @@ def test_one_port_for_two_devices_is_refused(tmp_path, capsys):
     assert "lidar and uwb are given the same port" in capsys.readouterr().err
 
 
+def test_one_client_of_a_server_is_one_device_of_a_kind(tmp_path, capsys):
+    ports = ["--uwb", "tlv:socket://127.0.0.1:1"] * 2
+    assert main(["record", *ports, "--out", str(tmp_path / "run.log")]) == 1
+    assert "uwb and uwb2 are given the same port" in capsys.readouterr().err
+
+
 class Robot(socketserver.StreamRequestHandler):
     """Send poses and ranges, in lines, to every client."""
 

@@ -198,6 +198,7 @@ def test_mappings_are_read_strictly():
         ("[[uwb]]\ntopc = 1", "did you mean 'topic'"),
         ("[uwb]\ntopic = 'x'", "uwb"),
         ("x = 1", "uwb"),
+        ("uwb = [1]", "must hold"),
         ('[[uwb]]\nanchor_format = "{:q}"', "not valid"),
         ('[[uwb]]\nanchor_format = "{:09999}"', "is not text around one"),
         ('[[uwb]]\nanchor_format = "{0.real}"', "is not text around one"),

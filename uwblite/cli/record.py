@@ -173,10 +173,9 @@ def device_links(args: argparse.Namespace, pose: Pose = (0.0, 0.0, 0.0)) -> list
     ports: dict[str, str] = {}
     for link in links:
         check_url(link.url)
-        if is_socket(link.url):
-            # A server may have several clients.
-            continue
-        if (other := ports.setdefault(os.path.realpath(link.url), link.name)) != link.name:
+        # A server may have several clients, each for a sensor of its own.
+        port = f"{link.name.removesuffix(str(link.number))} {link.url}" if is_socket(link.url) else os.path.realpath(link.url)
+        if (other := ports.setdefault(port, link.name)) != link.name:
             raise ConfigError(f"{other} and {link.name} are given the same port, {link.url}: a port has one device")
         pyserial()
     return links

@@ -164,7 +164,7 @@ def parse_mappings(text: str, path: str = "") -> tuple[UwbMapping, ...]:
     path = path or "uwb mapping"
     data = parse_toml(text, path)
     tables = data.get("uwb")
-    if set(data) - {"uwb"} or not isinstance(tables, list) or not tables:
+    if set(data) - {"uwb"} or not isinstance(tables, list) or not tables or not all(isinstance(each, dict) for each in tables):
         raise ConfigError(f"{path}: it must hold [[uwb]] tables and nothing else")
     try:
         return tuple(_checked(from_dict(UwbMapping, table)) for table in tables)
