@@ -405,6 +405,12 @@ def test_wheels_in_another_unit_are_multiplied_by_what_the_ranges_show():
     assert abs(scale.value) < 0.03
 
 
+def test_a_unit_that_a_lidar_contradicts_is_an_unusual_calibration_too(log):
+    """Wheels and lidar agree on the way, ranges do not: what multiplies the wheels must be taken back by the lidar."""
+    result = build_map(replace(log, ranges=replace(log.ranges, ranges=log.ranges.ranges * 1.15)))
+    assert {"odometry-unit", "unusual-calibration"} <= {f.kind for f in result.findings}
+
+
 @pytest.mark.slow
 def test_wheels_in_another_unit_are_reported_by_the_radio(shared_data):
     """A lawn mower whose log has wheels 1.4 times too short: its map has the size of the radios' own survey."""

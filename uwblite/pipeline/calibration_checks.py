@@ -29,7 +29,7 @@ from ..sensor_log import SensorLog
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
 
-_OTHER_UNIT = 0.12
+OTHER_UNIT = 0.12
 """Relative error of travelled distance from which on it is not a wheel radius to be calibrated but another unit."""
 TOLERANCE = 0.004
 """Offset of the lidar's clock, and error of a scan's duration, that clouds may have, s: an odometry that is wrong by 0.3 rad/s
@@ -98,10 +98,10 @@ def with_units_checked(config: MappingConfig, logs: Sequence[SensorLog]) -> Mapp
     would both have to be wrong, by one factor. With recordings of which some show nothing, it stays.
     """
     ways = np.array([float("nan") if log.screening is None else log.screening.lidar_by_wheels for log in logs])
-    if not np.all(np.abs(ways - 1.0) <= _OTHER_UNIT):
+    if not np.all(np.abs(ways - 1.0) <= OTHER_UNIT):
         return config
     priors = config.calibration
-    return replace(config, calibration=replace(priors, odometry_unit=min(priors.odometry_unit, _OTHER_UNIT)))
+    return replace(config, calibration=replace(priors, odometry_unit=min(priors.odometry_unit, OTHER_UNIT)))
 
 
 def without_known_calibration(config: MappingConfig, logs: Sequence[SensorLog]) -> MappingConfig:
@@ -128,7 +128,7 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
     calibration, recordings = estimate.graph.calibration, task.recordings
     places = [calibration.index("odometry_scale", recording=n) for n in range(len(recordings))]
     factors = np.array([1.0 if place < 0 else 1.0 + float(calibration.values[place]) for place in places])
-    factors = np.where(np.abs(factors - 1.0) > _OTHER_UNIT, factors, 1.0)
+    factors = np.where(np.abs(factors - 1.0) > OTHER_UNIT, factors, 1.0)
     other = estimate.other_heights
     for recording, factor in zip(recordings.each, factors.tolist(), strict=True):
         if factor != 1.0:
