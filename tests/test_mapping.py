@@ -405,6 +405,7 @@ def test_wheels_in_another_unit_are_multiplied_by_what_the_ranges_show():
     assert abs(scale.value) < 0.03
 
 
+@pytest.mark.slow
 def test_a_unit_that_a_lidar_contradicts_is_an_unusual_calibration_too(log):
     """Wheels and lidar agree on the way, ranges do not: what multiplies the wheels must be taken back by the lidar."""
     result = build_map(replace(log, ranges=replace(log.ranges, ranges=log.ranges.ranges * 1.15)))
