@@ -143,7 +143,7 @@ INGREDIENTS: dict[str, LeftOut] = {
     "other headings in the bootstrap": LeftOut(patches=(
         ("radio.bootstrap._with_heading_scale", lambda calibration, value: None if value else calibration),
     )),
-    "priors of units and ranges selected": _stage("radio_stages.select_priors"),
+    "priors of units and ranges selected": _stage("radio_stages.reestimate_noise_and_priors"),
     "tag pattern": _stage("lidar_stages._without_pattern"),
     "marginal likelihood of the radio's priors": LeftOut(
         ("calibration.range_scale_sound=0.15", "calibration.range_bias_sound=0.8")

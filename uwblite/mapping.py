@@ -109,7 +109,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
         if config.use_loops:
             yield closure_rounds.close_loops if config.loop_closure.method == "search" else closure_rounds.close_loops_as_paper
             yield anchor_places.decide_places
-            yield radio_stages.select_priors
+            yield radio_stages.reestimate_noise_and_priors
             if config.refinement.rounds:
                 yield lidar_stages.refine_jointly
                 yield lidar_stages.solve_by_own_errors

@@ -19,7 +19,7 @@ SPEED, TURN_RATE = 0.5, 0.5
 """Standard deviations of the motion that wheels do not count while they slip, m/s and rad/s: a robot is pushed as fast as
 people walk. They count at most all of their motion too much."""
 ASIDE = 0.1
-"""Uncounted motion across wheels that spin, as a share of that along them: they have hold of the ground to the side."""
+"""Uncounted motion across wheels that spin, as a share of that along them: tyres hold the ground to the side."""
 STEADY = 10.0
 """Time over which the false motion of a slip changes, s: while wheels spin, the robot's speed is as commanded."""
 _SHARE = LASTS / (EVERY + LASTS)

@@ -92,7 +92,7 @@ def with_slip_in_turns(estimate: Estimate, task: Task) -> Estimate:
 
 
 def with_units_checked(config: MappingConfig, logs: Sequence[SensorLog]) -> MappingConfig:
-    """Return the settings under which wheels are off by no more than a worn tyre is, where a lidar has measured their ways.
+    """Return the settings with the prior of a worn tyre for wheels of another unit, where a lidar has measured their ways.
 
     Ranges through walls may fit wheels several times too short better than a path that is right; lidar and wheels that agree
     would both have to be wrong, by one factor. With recordings of which some show nothing, it stays.

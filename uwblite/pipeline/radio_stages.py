@@ -1,7 +1,8 @@
 """Odometry and ranges: from dead reckoning to the first optimisation, and re-estimating the ranges later.
 
 Each recording is bootstrapped on its own, then the recordings are joined. Once the lidar has stiffened the trajectory,
-the ranges are re-estimated: their noise and the priors of their systematic errors.
+the ranges are re-estimated: their noise and the priors of their systematic errors. The prior of the wheels' scale is chosen
+there too, also without ranges.
 """
 
 from dataclasses import replace
@@ -216,7 +217,7 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     return estimate
 
 
-def select_priors(estimate: Estimate, task: Task) -> Estimate:
+def reestimate_noise_and_priors(estimate: Estimate, task: Task) -> Estimate:
     """Re-estimate the ranges' noise on the trajectory with loops closed, and the priors of units and systematic errors.
 
     Ranges have little weight meanwhile, so that sustained outliers of an anchor show in its residuals, unless ranges alone
