@@ -1,6 +1,7 @@
 """uwblite evaluate on results whose errors are known."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -197,3 +198,71 @@ def test_what_is_judged_by_the_truth_needs_it(result, capsys, option):
     judged = [option, str(root / "anchors.csv")]
     assert main([*words[:2], "--relations", str(root / "relations"), *judged]) == 2
     assert "need --truth" in capsys.readouterr().err
+
+
+def numbers(line):
+    """Return the numbers that stand alone in a line."""
+    return [float(word) for word in re.findall(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?![\w.])", line)]
+
+
+def uneven(root):
+    """Spread the trajectory's poses about the truth: every figure is another one."""
+    stamps, poses = read_tum(root / "map" / "trajectory.tum")
+    wave = np.sin(np.outer(np.arange(len(stamps)) ** 1.3, [0.1, 0.07, 0.05]))
+    write_tum(root / "map" / "trajectory.tum", stamps, se2.compose(poses, wave * [0.2, 0.1, 0.05]))
+
+
+def test_the_table_states_the_figures(result, capsys):
+    root, words = result
+    uneven(root)
+    assert main([*words, *options(root), "--delta", "2", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert main([*words, *options(root), "--delta", "2"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert found["trajectory"]["rpe_delta"] == 2.0
+    rows = (("position (ATE)", "ate", 1.0, "m"), ("heading", "heading", 180.0 / np.pi, "deg"),
+            ("relative (RPE)", "rpe_position", 1.0, "m per 2 m"),
+            ("relative heading", "rpe_heading", 180.0 / np.pi, "deg per 2 m"))  # fmt: skip
+    assert lines[0].split() == ["trajectory", "rmse", "mean", "median", "max"]
+    for line, (title, name, unit, of) in zip(lines[1:5], rows, strict=True):
+        figures = [unit * found["trajectory"][name][each] for each in ("rmse", "mean", "median", "max")]
+        assert len(set(figures)) == 4
+        assert line.strip().startswith(title)
+        assert line.endswith(f"  {of}")
+        assert numbers(line)[:4] == pytest.approx(figures, abs=5.1e-5)
+    assert lines[5] == "  400 of 400 true poses compared"
+    anchors = found["anchors"]
+    assert numbers(lines[6]) == pytest.approx([anchors["rmse"], 2], abs=5.1e-4)
+    stated = {line.split()[0]: float(line.split()[1]) for line in lines[7:9]}
+    assert stated == pytest.approx(anchors["errors"], abs=5.1e-4)
+    assert lines[9] == "  without an estimate: 1E05"
+    landmarks = found["landmarks"]
+    assert lines[10] == f"columns in the map: mean distance error {landmarks['mean']:.4f} m over 2 pairs"
+    for line, pair in zip(lines[11:13], landmarks["pairs"], strict=True):
+        assert line.strip().startswith(f"{pair['a']} - {pair['b']} ")
+        assert numbers(line) == pytest.approx([pair["true"], pair["found"], pair["error"]], abs=5.1e-4)
+        assert pair["error"] == pytest.approx(abs(pair["found"] - pair["true"]))
+    drawn = found["landmarks_along_trajectory"]["mean"]
+    assert lines[13:] == [f"columns as the trajectory draws them: mean distance error {drawn:.4f} m over 2 pairs"]
+
+
+def test_longer_stretches_longer_gaps_and_farther_columns_are_judged_where_that_is_asked_for(result, capsys):
+    root, words = result
+    uneven(root)
+
+    def figures(*more):
+        assert main([*words, "--json", *more]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    usual = figures()["trajectory"]
+    assert usual["rpe_delta"] == 1.0
+    assert figures("--delta", "3")["trajectory"]["rpe_position"]["rmse"] != usual["rpe_position"]["rmse"]
+    stamps, poses = read_tum(root / "map" / "trajectory.tum")
+    kept = (stamps < 110.05) | (stamps > 110.75)
+    write_tum(root / "map" / "trajectory.tum", stamps[kept], poses[kept])
+    assert [figures(*more)["trajectory"]["compared"] for more in ([], ["--max-gap", "0.5"])] == [400, 400 - int((~kept).sum())]
+    rows = [f"C{i},{x + 0.7},{y},{r}\n" for i, (x, y, r) in enumerate(COLUMNS, 1)]
+    (root / "columns.csv").write_text("name,x,y,radius\n" + "".join(rows))
+    columns = ["--landmarks", str(root / "columns.csv")]
+    assert figures(*columns)["landmarks"]["missing"] == []
+    assert figures(*columns, "--search-radius", "0.2")["landmarks"]["missing"] == ["C1", "C2", "C3"]

@@ -661,3 +661,48 @@ def test_the_captured_unit_is_emulated(shared_data):
     assert max(min(abs(scan.stamp - t) for t in sent) for scan in scans) < 0.002
     far = sum(math.isinf(r) for r in scans[0].ranges)
     assert far == sum(v in (0, 6) or v >= 5600 for v in unit.values) > 0
+
+
+def test_tag_that_answers_an_error_is_named_once_and_asked_on():
+    device, sent = tag()
+    receive = device.receive
+    device.receive = lambda data, now: b"\x40\x01\x04" if 4.0 < now - START < 5.0 and data else receive(data, now)
+    actions, _ = simulate(Dwm1001Driver(), device, 8.0)
+    (note,) = [note for note in of_kind(actions, Note) if note.name.startswith("uwb-error")]
+    assert (note.level, note.name) == ("warning", "uwb-error-4")
+    assert "the module answers error 4, busy" in note.text
+    assert of_kind(actions, RangeEpoch)[-1].stamp > START + 7.5
+    assert len(of_kind(actions, RangeEpoch)) > 0.7 * len(sent)
+
+
+@pytest.mark.parametrize("refuses", [False, True])
+def test_lidar_whose_laser_does_not_start_is_tried_a_few_times_and_its_port_then_opened_again(refuses):
+    """It takes the order and sends nothing, or refuses it."""
+    device, _ = lidar()
+    receive, asked = device.receive, []
+
+    def deaf(data, now):
+        if data.startswith(b"MD"):
+            asked.append(now)
+            return b"MD0044072501000\n" + (b"01Q\n\n" if refuses else b"00P\n\n")
+        return receive(data, now)
+
+    device.receive = deaf
+    actions, reopens = simulate(ScipDriver(), device, 60.0)
+    assert not of_kind(actions, LaserScan)
+    assert reopens
+    restarts = [note.text for note in of_kind(actions, Note) if note.name == "lidar-restart"]
+    words = "MD refused, status 01: a bad first step" if refuses else "no scan for too long"
+    assert restarts
+    assert all(text.startswith(f"lidar: {words}") and text.endswith("; starting it again") for text in restarts)
+    assert 4 * reopens <= len(asked) < 4 * (reopens + 1)
+
+
+def test_lidar_that_does_not_answer_the_order_to_measure_is_said_so():
+    device, _ = lidar()
+    receive = device.receive
+    device.receive = lambda data, now: b"" if data.startswith(b"MD") else receive(data, now)
+    actions, _ = simulate(ScipDriver(), device, 10.0)
+    restarts = [note.text for note in of_kind(actions, Note) if note.name == "lidar-restart"]
+    assert restarts
+    assert set(restarts) == {"lidar: no answer to MD; starting it again"}

@@ -364,3 +364,10 @@ def test_emulator_measures_once_after_bm_without_a_stream():
     assert device.receive(b"BM\n", 0.6) == b"BM\n00P\n\n"
     (scan,) = good(ScipProtocol().feed(device.receive(b"GD0044072501\n", 0.7), 0.7))
     assert len(scan.values) == 682
+
+
+@pytest.mark.parametrize("line", [b"m2@0x", b"m2@\x01k", b"m2@k"])
+def test_a_time_that_is_damaged_is_none(line):
+    good_line = encode(16000000, 4) + bytes([scip.checksum(encode(16000000, 4))])
+    assert feed_whole(ScipProtocol, frame("TM1", "00", good_line)) == [Reply(1.0, "TM1", "00", ("16000000",))]
+    assert feed_whole(ScipProtocol, frame("TM1", "00", line)) == [Corrupt("time with a wrong sum")]

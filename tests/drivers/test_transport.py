@@ -1,15 +1,18 @@
 """Ports: those that do not open say how to mend that, those that do are held alone and hold up nobody."""
 
 import os
+import select
+import socket
 import time
 from contextlib import closing
+from types import SimpleNamespace
 
 import pytest
 
 from uwblite.drivers import transport
 from uwblite.drivers.devices import open_device
 from uwblite.drivers.link import BACK_OFF, HANG, Link
-from uwblite.drivers.transport import _explain, open_port
+from uwblite.drivers.transport import PluggedIn, _explain, open_port, plugged_in, stable_name
 from uwblite.errors import DeviceError
 
 
@@ -128,3 +131,101 @@ def test_a_port_is_opened_again_where_no_byte_comes_and_a_device_that_is_silent_
         note, again = link.watch(50.0 + HANG + later)
         assert again is hangs
         assert note is None if words is None else words in note.text
+
+
+@pytest.fixture
+def bridge():
+    """A server's end of a TCP bridge, and the port on ours."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(20.0)
+        with closing(open_port(f"socket://127.0.0.1:{server.getsockname()[1]}", 115200)) as port, server.accept()[0] as far:
+            far.settimeout(20.0)
+            yield far, port
+
+
+def test_a_bridge_gives_what_has_come_takes_what_is_sent_and_says_that_it_is_closed(bridge):
+    far, port = bridge
+    assert port.read() == b""
+    far.sendall(b"here\n")
+    assert select.select([port.fileno()], [], [], 20.0)[0]
+    assert port.read() == b"here\n"
+    port.set_baud(9600), port.set_dtr(True)
+    port.write(b"there")
+    assert far.recv(100) == b"there"
+    with pytest.raises(DeviceError, match=f"{port.url}: it takes no bytes"):
+        [port.write(bytes(1 << 20)) for _ in range(100)]
+    far.close()
+    assert select.select([port.fileno()], [], [], 20.0)[0]
+    with pytest.raises(DeviceError, match=rf"{port.url}: (the other side closed the connection|unplugged or gone \(.+\))"):
+        port.read()
+    port.close()
+    with pytest.raises(DeviceError, match=rf"{port.url}: unplugged or gone \(.*Bad file descriptor"):
+        port.read()
+    with pytest.raises(DeviceError, match=rf"{port.url}: cannot write \(.*Bad file descriptor"):
+        port.write(b"x")
+
+
+def test_a_bridge_that_ends_in_peace_is_said_to_be_closed(bridge):
+    far, port = bridge
+    far.shutdown(socket.SHUT_WR)
+    assert select.select([port.fileno()], [], [], 20.0)[0]
+    with pytest.raises(DeviceError, match="the other side closed the connection"):
+        port.read()
+
+
+def test_a_line_whose_other_end_is_gone_is_unplugged(line):
+    port = open_port(line[1], 115200)
+    device, spare = os.openpty()
+    os.close(spare)
+    os.dup2(device, line[0])
+    os.close(device)
+    for act, words in ((port.read, r"unplugged or gone \("), (lambda: port.write(b"x"), r"cannot write \(")):
+        with pytest.raises(DeviceError, match=f"{line[1]}: {words}"):
+            act()
+    port.close()
+
+
+def test_speed_and_dtr_go_to_the_port_and_ports_without_them_pass_them_over():
+    with closing(open_port("loop://", 9600)) as port:
+        port.set_baud(57600)
+        port.set_dtr(False)
+        assert (port._serial.baudrate, port._serial.dtr) == (57600, False)
+        port.set_dtr(True)
+        assert port._serial.dtr
+        port.set_baud(-1)
+        port.write(b"round")
+        assert port.read() == b"round"
+        assert port.read() == b""
+
+
+def test_ports_of_this_computer_have_lasting_names_and_what_is_no_device_is_left_out(tmp_path, monkeypatch):
+    class Found(SimpleNamespace):
+        def __lt__(self, other):
+            return self.device < other.device
+
+    def found(device, vid, pid, *words):
+        named = zip(("manufacturer", "product", "description"), words, strict=True)
+        return Found(device=str(device), vid=vid, pid=pid, **dict(named))
+
+    names = tmp_path / "by-id"
+    names.mkdir()
+    for name in ("ttyACM0", "ttyUSB3"):
+        (tmp_path / name).touch()
+    (names / "usb-SEGGER").symlink_to(tmp_path / "ttyACM0")
+    monkeypatch.setattr(transport, "BY_ID", names)
+    ports = [
+        found("/dev/ttyS7", None, None, None, None, "ttyS7"),
+        found(tmp_path / "ttyUSB3", 0x10C4, 0xEA60, None, None, "CP2102"),
+        found(tmp_path / "ttyACM0", 0x1366, 0x0105, "SEGGER", "J-Link", "J-Link CDC"),
+        found("/dev/ttyS0", None, None, None, None, "ttyS0"),
+    ]
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: ports)
+    assert plugged_in() == [
+        PluggedIn("/dev/ttyS0", "ttyS0", ""),
+        PluggedIn(str(names / "usb-SEGGER"), "SEGGER J-Link", "1366:0105"),
+        PluggedIn(str(tmp_path / "ttyUSB3"), "CP2102", "10c4:ea60"),
+    ]
+    assert stable_name(str(tmp_path / "ttyACM0")) == str(names / "usb-SEGGER")
+    assert stable_name(str(tmp_path / "ttyUSB3")) is None
+    assert stable_name(f"socket://{tmp_path}/ttyACM0") is None
+    assert stable_name(str(names / "usb-SEGGER")) == str(names / "usb-SEGGER")
