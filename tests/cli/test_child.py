@@ -1,5 +1,6 @@
 """A command in a process of its own ends with the one that started it."""
 
+import os
 import signal
 import socket
 import subprocess
@@ -9,6 +10,7 @@ import time
 import pytest
 from helpers.served import PATIENCE
 
+from uwblite import __version__
 from uwblite.cli import child as child_module
 from uwblite.cli.child import Child
 
@@ -48,3 +50,26 @@ def test_a_command_that_does_not_end_when_asked_is_killed(monkeypatch):
         signal.signal(signal.SIGTERM, usual)
     stuck.stop()
     assert stuck.code() == -signal.SIGKILL
+
+
+def test_of_what_a_command_says_the_last_line_counts_or_the_error_among_it(monkeypatch):
+    """Of the last 2,000 bytes; what is not text is replaced, and a line is cut."""
+    child = Child(["--version"], 19)
+    try:
+        priority = os.getpriority(os.PRIO_PROCESS, child._process.pid)
+        assert child._process.wait(PATIENCE) == child.code() == 0
+        assert (priority, child.output()) == (19, f"uwblite {__version__}")
+        for output, told in (
+            (b"", ""),
+            (b"first\nsecond\n\n", "second"),
+            (b"uwblite: error: the disk is full\nand more\n", "uwblite: error: the disk is full"),
+            (b"error: long ago\n" + b"x" * 2000, "x" * 400),
+            (b"\xff\n", "\ufffd"),
+        ):
+            child._output.seek(0)
+            child._output.truncate()
+            child._output.write(output)
+            child._output.flush()
+            assert child.output() == told
+    finally:
+        child.stop()

@@ -101,3 +101,112 @@ def test_how_much_is_said_is_chosen_by_every_command_anew(tmp_path, capsys):
     for words, level in levels.items():
         assert main(["convert", str(tmp_path / "map"), str(tmp_path / "path.tum"), "--force", *words]) == 0
         assert logging.getLogger("uwblite").level == level
+
+
+def drawn(monkeypatch, *calls, columns=80):
+    """Return what a bar writes that is called at times, s: (time, stage, done, total, share)."""
+    stream, now = Terminal(), [0.0]
+    progress = console.Progress(stream, clock=lambda: now[0])
+    monkeypatch.setattr(progress, "_columns", lambda: columns)
+    pieces = []
+    for now[0], *call in calls:
+        before = len(stream.getvalue())
+        progress(*call)
+        pieces.append(stream.getvalue()[before:])
+    return progress, stream, pieces
+
+
+def test_a_bar_is_drawn_ten_times_a_second_at_most_and_at_the_end_of_a_stage(monkeypatch):
+    calls = [(1.0, "grid", 1, 9), (1.05, "grid", 2, 9), (1.1, "grid", 3, 9), (1.15, "grid", 9, 9), (1.16, "summary", 1, 9)]
+    progress, stream, pieces = drawn(monkeypatch, *calls)
+    assert [bool(piece) for piece in pieces] == [True, False, True, True, True]
+    assert pieces[0] == f"\r{console.progress_line('grid', 1 / 9, 0.0)}"
+    # The line of another stage is wiped before.
+    assert pieces[4].startswith("\r" + " " * len(console.progress_line("grid", 1.0, 0.0)) + "\r\r[")
+    progress.close()
+    assert stream.getvalue().endswith("\r" + " " * len(console.progress_line("summary", 1 / 9, 0.0)) + "\r")
+    before = stream.getvalue()
+    progress.close()
+    assert stream.getvalue() == before
+
+
+def test_a_bar_states_the_time_left_of_its_stage_or_of_the_whole(monkeypatch):
+    calls = [(10.0, "grid", 0, 4), (20.0, "grid", 1, 4), (30.0, "grid", 1, 4, 0.5), (31.0, "grid", 5, 0)]
+    _, _, pieces = drawn(monkeypatch, *calls)
+    assert "about" not in pieces[0]
+    assert "[#####               ]  25 %  grid  about 30.0 s left" in pieces[1]
+    assert "[##########          ]  50 %  grid  about 30.0 s left" in pieces[2]
+    assert pieces[3].rstrip(" ") == "\rgrid ..."
+    assert len(pieces[3]) == len(pieces[2])
+
+
+def test_a_bar_is_no_wider_than_the_terminal_and_has_nothing_that_it_obeys(monkeypatch):
+    _, _, pieces = drawn(monkeypatch, (1.0, "a\x1b[31m stage with a long name", 1, 2), columns=40)
+    assert pieces[0] == "\r" + "[##########          ]  50 %  a\\x1b[31m stage"[:39]
+
+
+def test_a_line_takes_the_place_of_the_bar_which_is_quiet_where_that_is_wanted(monkeypatch, capsys):
+    progress, stream, _ = drawn(monkeypatch, (1.0, "grid", 1, 2))
+    for write in (console.say, console.note, lambda text: console.fail(text, 1)):
+        progress._draw("bar")
+        write("text")
+        assert stream.getvalue().endswith("\rbar\r   \r") or stream.getvalue().endswith("\r   \r")
+    progress.close()
+    console.set_up(quiet=True)
+    assert not console.Progress(Terminal()).active
+    assert [console.fail("why", code) for code in (1, 130)] == [1, 130]
+    assert capsys.readouterr().err.endswith("uwblite: error: why\nuwblite: why\n")
+
+
+@pytest.mark.parametrize(
+    ("share", "elapsed", "told"),
+    [(0.05, 10.0, False), (0.06, 10.0, True), (0.5, 2.0, False), (0.5, 2.1, True), (1.0, 10.0, False), (-1.0, 10.0, False)],
+)
+def test_the_time_left_is_told_once_something_is_known_of_it(share, elapsed, told):
+    assert ("left" in console.progress_line("grid", share, elapsed)) is told
+
+
+class Full(io.StringIO):
+    """A stream behind which a disk is full, or a reader is gone."""
+
+    def __init__(self, error):
+        super().__init__()
+        self.error = error
+
+    def write(self, text):
+        raise self.error
+
+    def fileno(self):
+        raise ValueError
+
+
+@pytest.mark.parametrize(
+    ("error", "lost"),
+    [(OSError(28, "No space left on device"), "stdout: No space left on device; free some"), (BrokenPipeError(), "")],
+)
+def test_a_stdout_that_takes_nothing_is_told_at_the_end_and_a_reader_that_left_is_not(monkeypatch, capsys, error, lost):
+    monkeypatch.setattr("sys.stdout", Full(error))
+    console.say("result")
+    assert console.flush() is not bool(lost)
+    assert (f"uwblite: error: {lost}" if lost else "") in capsys.readouterr().err
+    assert console.flush()
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr("sys.stderr", Full(error))
+    console.note("nobody reads that")
+    assert console.flush()
+
+
+@pytest.mark.parametrize(
+    ("number", "hint"),
+    [
+        (13, "; check who owns it, or choose another place"),
+        (30, "; choose a place that can be written to"),
+        (5, ""),
+        (None, ""),
+    ],
+)
+def test_an_error_of_the_system_has_its_place_and_the_way_out_where_there_is_one(number, hint):
+    assert console.os_error_text(OSError(number, "why", "x.log")) == f"x.log: why{hint}"
+    assert console.os_error_text(OSError(number, "why")) == f"why{hint}"
+    assert console.os_error_text(TimeoutError()) == "TimeoutError"
+    assert console.os_error_text(OSError("words")) == "words"

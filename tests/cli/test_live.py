@@ -1,5 +1,6 @@
 """`uwblite localize --live`: lines of JSON on stdout, warnings on stderr, and usage errors."""
 
+import argparse
 import dataclasses
 import json
 import os
@@ -298,3 +299,60 @@ def test_the_page_shows_the_map_and_the_robot_on_it(room, capsys, monkeypatch):
     assert last["advice"] == []
     assert len(last["trail"]) > 5
     json.dumps([value for _, value in published], allow_nan=False)
+
+
+def test_a_base_alone_is_read_until_it_is_stopped_and_leaves_the_pose_unknown(circle, capsys):
+    code, found, err, _ = driven(circle, 4.0, ("base",), capsys)
+    assert code == 3
+    assert len(found) > 4
+    assert all(line["lost"] for line in found)
+    assert np.all(np.diff([line["stamp"] for line in found]) > 0.0)
+    # Two lines a second, of a base that sends fifty.
+    assert np.median(np.diff([line["stamp"] for line in found])) == pytest.approx(0.5, abs=0.03)
+    assert "s] info: odometry: base open" in err
+
+
+def test_lines_come_as_often_as_is_asked_for_and_at_once_where_the_pose_is_lost_or_found(room, capsys):
+    def state(stamp, lost=False, age=0.0):
+        none = np.zeros(3)
+        return LocalizerState(stamp, none, np.eye(3), 1.0, none, lost, age=age)
+
+    args = argparse.Namespace(late=2.0, lost_after=10.0, rate=5.0)
+    tracker, shown = live.Tracker(known(), args), []
+    tracker.on_state = lambda each: shown.append(each.stamp)
+    for each in [state(-np.inf, True), state(1.0), state(1.1), state(1.19), state(1.2), state(1.3, True), state(1.35, True),
+                 state(1.36), state(1.37, age=0.5), state(0.5)]:  # fmt: skip
+        tracker._say(each)
+    assert [line["stamp"] for line in lines_of(capsys.readouterr().out)] == [1.0, 1.2, 1.3, 1.36, 1.37, 0.5]
+    assert shown == [1.0, 1.1, 1.19, 1.2, 1.3, 1.35, 1.36, 1.37, 0.5]
+    assert tracker.ended(True) == 130
+    assert tracker.ended(False) == 0
+    tracker._say(state(2.0, True))
+    assert tracker.ended(False) == 3
+
+
+@pytest.mark.parametrize("more", [["--picture", "a.png"], ["--covariance", "a.csv"], ["--out", "a.tum"]])
+def test_files_belong_to_a_recording_that_has_ended(room, capsys, more):
+    assert main(["localize", str(room[1]), "--live", "--map", str(room[0]), *more]) == 2
+    assert f"{more[0]} belongs to a recording that has ended; --live writes lines to stdout" in capsys.readouterr().err
+
+
+def test_numbers_in_a_line_have_as_many_digits_as_mean_something():
+    pose, sigma = np.array([1.23456789, -2.0, 0.5]), np.full((3, 3), 0.123456789)
+    state = LocalizerState(1.23456789, pose, sigma, 0.98765, 2.0 * pose, False)
+    said = json.loads(line_of(dataclasses.replace(state, alternatives=np.array([[1.23456, 2.0, 3.0]] * 20))))
+    assert (said["stamp"], said["quality"]) == (1.234568, 0.988)
+    assert (said["pose"], said["odometry"]) == ([1.23457, -2.0, 0.5], [2.46914, -4.0, 1.0])
+    assert said["covariance"] == [[0.1235] * 3] * 3
+    assert said["alternatives"] == [[1.235, 2.0, 3.0]] * live.MOST_ALTERNATIVES
+
+
+def test_the_part_of_a_long_log_that_is_not_read_is_told(tmp_path, monkeypatch, capsys):
+    log = tmp_path / "run.log"
+    log.write_bytes(b"ODOM 0 0 0 0 0 0 1.0 h 1.0\n" * 200_000)
+    pieces = live._growing(str(log), 0.01, lambda: False)
+    skipped = log.stat().st_size - sum(map(len, pieces))
+    told = re.fullmatch(rf"uwblite: (\d+\.\d) MB of {log} lie further back and are not read\n", capsys.readouterr().err)
+    assert float(told[1]) == pytest.approx(skipped / 1e6, abs=0.2)
+    assert skipped > 1e6
+    assert list(live._growing(str(log), None, lambda: True)) == []

@@ -1,5 +1,7 @@
 """What `uwblite record` and `uwblite devices` say to mistakes: one clear line, at once, and no log is begun."""
 
+import json
+import re
 import socket
 import subprocess
 import sys
@@ -9,6 +11,7 @@ import urllib.request
 import pytest
 from conftest import ROOT
 
+from uwblite import __version__
 from uwblite.cli import main
 from uwblite.drivers.devices import DEVICES
 from uwblite.drivers.transport import PluggedIn, check_url
@@ -213,3 +216,38 @@ def test_every_kind_of_device_is_listed_with_its_options(capfd):
     listed = capfd.readouterr().out
     assert all(f"--{kind.sensor} {kind.name}:PORT" in listed for kind in DEVICES.values())
     assert "time_unit" in listed
+
+
+def test_a_log_is_gone_on_with_from_its_last_pose_and_a_clock_behind_it_is_moved(tmp_path, capsys):
+    out = tmp_path / "run.log"
+    ahead = time.time() + 3600.0
+    out.write_text(f"ODOM 1 2 0.5 0 0 0 {ahead:.6f} h 0.0\n")
+    base = f"kobuki:{tmp_path / 'none'}"
+    words = ["record", "--odometry", base, "--out", str(out), "--duration", "0.1", "--wait", "--append"]
+    assert main(words) == 3
+    (told,) = [line for line in out.read_text().splitlines() if "goes on with a log" in line]
+    behind = float(re.search(r"this computer's clock is (\d+) s behind the log and was moved", told)[1])
+    assert behind == pytest.approx(3600.0, abs=5.0)
+    (params,) = [line.split() for line in out.read_text().splitlines() if line.startswith("PARAM host_monotonic_zero")]
+    assert float(params[3]) == pytest.approx(ahead + 1.0, abs=5.0)
+    assert float(params[2]) == pytest.approx(ahead + 1.0 - time.monotonic(), abs=5.0)
+    out.write_text("ODOM 1 2 0.5 0 0 0 10.0 h 0.0\n")
+    assert main(words) == 3
+    assert "was moved" not in out.read_text()
+
+
+def test_what_was_recorded_is_summed_up_for_programs(tmp_path, capsys):
+    out = tmp_path / "run.log"
+    words = ["record", "--uwb", str(tmp_path / "none"), "--out", str(out), "--duration", "0.1", "--wait", "--json"]
+    assert main(words) == 3
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["log"] == str(out)
+    assert (summary["parts"], summary["bytes"]) == (1, out.stat().st_size)
+    assert 0.1 <= summary["seconds"] < 5.0
+    assert summary["doubts"] == ["uwb: no data at all"]
+    assert summary["devices"] == {
+        "uwb": {"messages": 0, "lost": 0, "corrupt": {}, "connects": 0, "silent_seconds": 0.0, "anchors": {}}
+    }
+    head = out.read_text().splitlines()[:2]
+    assert head[0] == "# CARMEN Logfile"
+    assert head[1].endswith(f"recorded by uwblite {__version__}: uwb {tmp_path / 'none'}")

@@ -6,14 +6,17 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import weakref
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 import uwblite
 from uwblite.cli import console, main
+from uwblite.cli.interruption import interruptible, stopped_by
 
 ENVIRONMENT = os.environ | {
     "UWBLITE": f"{sys.executable} -m uwblite", "PYTHONPATH": str(Path(uwblite.__file__).parents[1])
@@ -166,3 +169,43 @@ def test_until_ctrl_c_is_handled_nothing_is_imported_that_python_has_not_loaded(
         [sys.executable, "-c", program], env=ENVIRONMENT, capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stdout.split() == ["uwblite", "uwblite.__main__"]
+
+
+def test_in_a_thread_and_where_ctrl_c_is_ignored_signals_are_left_as_they_are():
+    usual = signal.getsignal(signal.SIGINT)
+    kept = []
+
+    def look():
+        with interruptible() as came:
+            kept.append((came, signal.getsignal(signal.SIGINT)))
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    thread.join()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        look()
+    finally:
+        signal.signal(signal.SIGINT, usual)
+    assert kept == [([], usual), ([], signal.SIG_IGN)]
+    look()
+    assert kept[-1][1] is not usual
+    assert signal.getsignal(signal.SIGINT) is usual
+
+
+def test_signals_that_stop_a_verb_are_kept_in_their_order_and_given_back():
+    usual = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    with stopped_by(signal.SIGINT, signal.SIGTERM) as stopped:
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stopped == [signal.SIGTERM, signal.SIGINT]
+    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == usual
+
+
+def test_other_exceptions_that_python_drops_go_where_they_went(monkeypatch):
+    dropped = []
+    monkeypatch.setattr(sys, "unraisablehook", dropped.append)
+    with interruptible() as came:
+        sys.unraisablehook(SimpleNamespace(exc_type=ValueError))
+        assert [error.exc_type for error in dropped] == [ValueError]
+        assert came == []

@@ -5,6 +5,8 @@ import os
 import re
 import shutil
 import signal
+import subprocess
+import sys
 import time
 import urllib.request
 from contextlib import nullcontext
@@ -274,3 +276,28 @@ def test_a_watch_that_is_told_to_end_does_so_as_by_ctrl_c(tmp_path, monkeypatch,
     assert "open http://127.0.0.1:1/" in output.out
     assert "the page has ended" in output.err
     assert len(closed) == 1
+
+
+def test_time_of_rounds_is_that_of_the_processes_that_have_ended_and_a_log_is_as_old_as_its_last_byte(tmp_path):
+    before = watch._spent_on_rounds(1e9)
+    subprocess.run([sys.executable, "-c", "sum(range(3_000_000))"], check=True)
+    assert 0.0 < watch._spent_on_rounds(1e9) - before < 60.0
+    log = tmp_path / "run.log"
+    log.touch()
+    os.utime(log, (time.time() - 100.0, time.time() - 100.0))
+    assert watch._age(str(log)) == pytest.approx(100.0, abs=30.0)
+    os.utime(log, (time.time() + 100.0, time.time() + 100.0))
+    assert watch._age(str(log)) == watch._age(str(tmp_path / "none")) == 0.0
+
+
+def test_a_round_that_cannot_begin_has_failed(watched, monkeypatch):
+    made, log, _, state = watched
+
+    def refuse(*_):
+        raise OSError(11, "no more processes")
+
+    monkeypatch.setattr(watch, "Child", refuse)
+    log.write_text(odom_lines(1000.0, 1030.0))
+    made.step(0.0)
+    assert "the last round failed: [Errno 11] no more processes" in state()["rounds"]
+    assert (made.last.failed, made.last.ended) == (True, 0.0)

@@ -1,12 +1,14 @@
 """Who does the work: this process, some processes, or a scheduler that may be absent."""
 
 import argparse
+import contextlib
 import multiprocessing
 import os
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -126,3 +128,31 @@ def test_workers_end_with_the_process_that_started_them(tmp_path):
     main_process.kill()
     main_process.communicate(timeout=120)  # ends when the last worker has closed what it inherited
     assert len(found) == 2
+
+
+def test_the_executor_of_a_scheduler_is_given_and_its_connection_closed(monkeypatch):
+    seen = []
+
+    class Client:
+        def __init__(self, address, timeout):
+            seen.append((address, timeout))
+
+        def run(self, function, on_error):
+            return {"a": function()}
+
+        def get_executor(self, pure):
+            seen.append(pure)
+            return contextlib.nullcontext("executor")
+
+        def close(self):
+            seen.append("closed")
+
+    monkeypatch.setitem(sys.modules, "distributed", SimpleNamespace(Client=Client))
+    with workers.workers(1, "tcp://head:8786") as executor:
+        assert executor == "executor"
+    assert seen == [("tcp://head:8786", 10), False, "closed"]
+    seen.clear()
+    monkeypatch.setattr(workers, "_compare_versions", lambda client: (_ for _ in ()).throw(ConfigError("other")))
+    with pytest.raises(ConfigError, match="other"), workers.cluster("tcp://head:8786"):
+        pass
+    assert seen[-1] == "closed"
