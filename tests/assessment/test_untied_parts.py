@@ -168,6 +168,31 @@ def test_a_middle_without_matches_is_loose_unless_a_closure_connects_both_sides(
     assert loose(edges=sides[0], poses=wide) == [], "less than 1 % of the map"
 
 
+def test_a_loose_stretch_is_told_with_its_ends_its_way_and_the_error_of_its_far_end():
+    """Scans hold keyframes 20 to 30 and 70 to 79 of 0.3 m each: 6 m before, 12 m in between and 6 m behind."""
+    edges = tuple(scan_edge(k, k + 1) for k in (*range(18, 30), *range(70, 81)))
+    wheels = chained(POSES, np.array([0.01, 0.01, 0.003]))
+    for scale in (1.0, 3.0):
+        poses = scale * POSES
+        estimate = estimate_of(Graph(poses, edges=edges), odometry=wheels)
+        found = list(check_untied_parts(estimate, task_of(recordings_of(poses, STAMPS))))
+        stretches = ((0.0, 20.0), (79.0, 99.0), (30.0, 70.0)) if scale > 1.0 else ((30.0, 70.0),)
+        assert tuple(finding.stretches[0] for finding in found) == stretches
+        for finding, (start, end) in zip(found, stretches, strict=True):
+            way = 0.3 * scale * (end - start)
+            middle = start == 30.0
+            error = (0.5 if middle else 1.0) * 0.5 * 0.02 * way**2
+            assert finding.figures["way"] == pytest.approx(way)
+            assert finding.figures["error"] == pytest.approx(error)
+            assert finding.figures["at"] == (20.0 if start == 0.0 else start)
+            when = "from t = 30 to 70 s" if middle else "until t = 20 s" if start == 0.0 else "from t = 79 s"
+            assert finding.text.startswith(f"{when}, over {way:.0f} m, ")
+            assert f"drift by {error:.1f} m" in finding.text
+            cut = "`end=30` and `start=70` leave" if middle else "`start=20` leaves" if start == 0.0 else "`end=79` leaves"
+            assert finding.cure == f"{cut} that part out"
+            assert (finding.severity, finding.kind, finding.recording) == ("doubt", "untied-parts", 1)
+
+
 def test_a_robot_that_stands_goes_not_astray():
     assert loose(measured((0, 50)), poses=0.01 * POSES) == []
 

@@ -658,3 +658,13 @@ def test_a_laser_line_that_breaks_off_behind_its_readings_is_broken(tmp_path):
     (tmp_path / "a.log").write_text(odometry(60) + whole + whole[: whole.index("3.0") + 3] + "\n")
     log = read_log(tmp_path / "a.log")
     assert (log.notes.broken, len(log.scans.stamps)) == (1, 1)
+
+
+@pytest.mark.parametrize("short", ["UWB A 3.0 100 robot 9.5", "GYRO 0.1 0 robot 9.5"])
+def test_where_one_kind_of_message_has_ipc_timestamp_another_one_without_it_is_broken(tmp_path, short):
+    """However many lines are read at once."""
+    lines = [f"ODOM {k} 0 0 0 0 0 {k}.5 robot {k}.5" for k in range(9)]
+    (tmp_path / "run.log").write_text("\n".join([*lines, short]) + "\n")
+    notes = read_log(tmp_path / "run.log", max_broken_share=0.5).notes
+    fields = len(short.split())
+    assert notes.broken_lines == ((10, f"{short.split()[0]} has {fields} fields, expected {fields + 1}"),)
