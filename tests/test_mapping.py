@@ -406,10 +406,11 @@ def test_wheels_in_another_unit_are_multiplied_by_what_the_ranges_show():
 
 
 @pytest.mark.slow
-def test_a_unit_that_a_lidar_contradicts_is_an_unusual_calibration_too(log):
-    """Wheels and lidar agree on the way, ranges do not: what multiplies the wheels must be taken back by the lidar."""
+def test_ranges_that_wheels_and_lidar_contradict_have_the_wrong_scale(log):
     result = build_map(replace(log, ranges=replace(log.ranges, ranges=log.ranges.ranges * 1.15)))
-    assert {"odometry-unit", "unusual-calibration"} <= {f.kind for f in result.findings}
+    (scales,) = [f for f in result.findings if f.kind == "scales"]
+    assert scales.figures["range_scale"] == pytest.approx(1.15, abs=0.03)
+    assert "odometry-unit" not in {f.kind for f in result.findings}
 
 
 @pytest.mark.slow

@@ -88,10 +88,8 @@ def _first_optimisation(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Ta
     if np.all(factors == 1.0):
         return estimate, task
     logs = [log.with_odometry_times(factor) for log, factor in zip(logs, factors.tolist(), strict=True)]
-    # A unit that was set by the ranges gives no information about the unit of the ranges, unless a lidar knows about it.
-    priors = config.calibration
-    known = priors.odometry_unit <= calibration_checks.OTHER_UNIT
-    free = priors if known else replace(priors, odometry_scale=priors.odometry_unit)
+    # A unit that was set by the ranges gives no information about the unit of the ranges.
+    free = replace(config.calibration, odometry_scale=config.calibration.odometry_unit)
     task = replace(task, recordings=gather(logs, config.keyframes), config=replace(config, calibration=free))
     return radio_stages.first_optimisation(task), task
 

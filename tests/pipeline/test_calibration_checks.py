@@ -251,6 +251,11 @@ def test_wheels_whose_ways_a_lidar_measures_are_in_metres_whatever_the_ranges_sa
     assert replace(found, calibration=config.calibration) == config
     if not checked:
         assert found is config
+    # What is known of the wheels the ranges do not change.
+    graph = Graph(np.zeros((2, 3)), calibration=Calibration((UnknownKey("odometry_scale", recording=0),), np.array([0.4])))
+    task = replace(task_of(standing()), config=found)
+    assert odometry_unit_factors(estimate_of(graph), task).tolist() == ([1.0] if checked else [1.4])
+    assert bool(task.stages.facts) != checked
 
 
 @pytest.mark.parametrize(("late", "radio", "lidar"), [

@@ -166,6 +166,14 @@ def test_the_likeliest_unit_of_length_is_the_wrong_one(scale, unit, wide):
     assert found["odometry_scale"] == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.parametrize("scale", [1.1, 1.15, 1.3])
+def test_where_a_lidar_knows_the_wheels_unit_a_radio_may_be_off_by_more(scale):
+    graph, edges = driven(1, scale)
+    found = widths(select_priors(graph, edges, replace(CONFIG, odometry_unit=0.12)))
+    assert found["range_scale"] == pytest.approx(CONFIG.range_scale)
+    assert found["odometry_scale"] == pytest.approx(CONFIG.odometry_scale, rel=1e-12)
+
+
 @pytest.mark.parametrize(("count", "wide"), [(1.0, False), (1.03, False), (0.91, True), (1.1, True)])
 def test_without_ranges_wheels_that_a_lidar_finds_far_off_get_a_wide_prior(count, wide):
     """Of 50 m, each metre is measured to 5 cm; nothing is said of a radio."""

@@ -15,6 +15,7 @@ from ..graph.calibration import HEIGHT, RANGE_SCALE, Unknown
 from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate
+from ..pipeline.calibration_checks import OTHER_UNIT
 from ..pipeline.estimate import Estimate, Task
 from ..screening.units import likely_unit
 from ..sensor_log.sensors import name_and_number
@@ -28,8 +29,6 @@ from .untied_parts import check_untied_parts, check_untied_recordings
 
 _UNUSUAL = 3.0
 """Prior standard deviations beyond which an estimate gets a warning."""
-_OTHER_LENGTH = 0.15
-"""Relative difference of lengths by two sensors beyond which one of them is wrong; single scans have a few per cent."""
 _RADIO_OR_WHEELS = "check the radio's settings and, where no lidar measures the distances, the scale of the wheels"
 _LOST_WAY = 0.03
 """Share of the distance that, by the ranges, the wheels missed, from which on a map is too short."""
@@ -198,7 +197,7 @@ def check_calibration(
     for value in calibrated:
         scale = value.key.kind == RANGE_SCALE
         sigma = task.config.calibration.range_scale_sound if scale else usual[value.key].sigma
-        clear = abs(value.value) > _UNUSUAL * max(sigma, value.sigma) and not (scale and abs(value.value) > _OTHER_LENGTH)
+        clear = abs(value.value) > _UNUSUAL * max(sigma, value.sigma) and not (scale and abs(value.value) > OTHER_UNIT)
         if value.state != "estimated" or value.key.kind == HEIGHT or not clear:
             continue
         unit = "" if value.unit == "1" else f" {value.unit}"
@@ -224,12 +223,12 @@ def check_lengths(estimate: Estimate, task: Task) -> Iterator[Finding]:
     calibration = estimate.graph.calibration
     place = calibration.index(RANGE_SCALE)
     error = float(calibration.values[place]) if place >= 0 and estimate.placed.any() else 0.0
-    if abs(error) > _OTHER_LENGTH:
+    if abs(error) > OTHER_UNIT:
         text = f"the ranges are {1.0 + error:.2f} times the distances on the map: {_RADIO_OR_WHEELS}{likely_unit(1.0 + error)}"
         yield doubt("scales", text, range_scale=1.0 + error)
     screened = (recording.log.screening for recording in task.recordings.each)
     ratios = np.array([screening.lidar_by_wheels for screening in screened if screening is not None])
-    off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > _OTHER_LENGTH)]
+    off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > OTHER_UNIT)]
     if len(off):
         text = (
             f"the lidar measures {off[0]:.2f} times the distance that the wheels count, and the map has the lidar's scale; "

@@ -123,9 +123,12 @@ def without_known_calibration(config: MappingConfig, logs: Sequence[SensorLog]) 
 def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
     """Return the factor (r,) by which the odometry of each recording is to be multiplied to be in metres.
 
-    It is 1 where the unit is right up to what a calibration of the wheels' radius may take up.
+    It is 1 where the unit is right up to what a calibration of the wheels' radius may take up, and where it is known: then the
+    ranges have other lengths.
     """
     calibration, recordings = estimate.graph.calibration, task.recordings
+    if task.config.calibration.odometry_unit <= OTHER_UNIT:
+        return np.ones(len(recordings))
     places = [calibration.index("odometry_scale", recording=n) for n in range(len(recordings))]
     factors = np.array([1.0 if place < 0 else 1.0 + float(calibration.values[place]) for place in places])
     factors = np.where(np.abs(factors - 1.0) > OTHER_UNIT, factors, 1.0)

@@ -34,7 +34,8 @@ class UnitPolicy:
     off: float = 1.0
     """Prior odds that the radio's scale is off, by any order of magnitude, against being right; and the same of biases."""
     farthest: float = 0.08
-    """Largest relative error of a radio's scale: it measures times of flight. 0.07 has been observed."""
+    """Largest relative error of a radio's scale, unless the wheels' unit is known better: it measures times of flight. 0.07 has
+    been observed."""
     short: float = -0.01
     too_short: float = 0.01
     """Relative error from which on ranges are shorter than the speed of light allows, and the factor on the odds of such a
@@ -91,7 +92,9 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
         # What a robot that stands measured determines no unit.
         known = bool(np.isfinite(worth[floats, 0]))
         off = float(_mean_under(mean, covariance, before, tried[floats][0])[0]) if known else np.inf
-        against = -np.inf if abs(off) > UnitPolicy.farthest else np.log(UnitPolicy.too_short) if off < UnitPolicy.short else 0.0
+        against = np.log(UnitPolicy.too_short) if off < UnitPolicy.short else 0.0
+        if abs(off) > UnitPolicy.farthest and config.odometry_unit > config.range_scale:
+            against = -np.inf
         odds = odds + np.where((hypothesis == 0) & (np.arange(len(odds)) > 0), against, 0.0)
     worth = worth + odds[:, None] + np.log(_odds(len(biases)))
     likely = np.exp(worth - worth.max())
