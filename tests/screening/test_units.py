@@ -8,6 +8,7 @@ import pytest
 from uwblite.errors import DataError
 from uwblite.screening.units import (
     heading_agreement,
+    heading_reading,
     likely_unit,
     refuse_degrees,
     refuse_other_ranges,
@@ -114,13 +115,13 @@ def test_a_heading_along_the_path_agrees_forwards_and_backwards():
     path = arc()
     heading = path.poses[:, 2]
     for other in (heading, heading + np.pi, np.angle(np.exp(1j * (heading + 3.0)))):
-        agreement, varied = heading_agreement(with_heading(path, other))
+        agreement, straight = heading_agreement(with_heading(path, other))
         assert agreement == pytest.approx(1.0, abs=0.01)
-        assert varied
+        assert straight < 0.9
     assert heading_agreement(with_heading(path, -heading), -1.0)[0] == pytest.approx(1.0, abs=0.01)
     assert heading_agreement(with_heading(path, 0.5 * heading), 2.0)[0] == pytest.approx(1.0, abs=0.01)
     assert heading_agreement(with_heading(path, -heading))[0] < 0.5
-    assert not heading_agreement(arc(turn=0.1))[1]
+    assert heading_agreement(arc(turn=0.1))[1] > 0.9
 
 
 def test_agreement_is_a_mean_over_the_way_and_not_over_the_readings():
@@ -128,12 +129,12 @@ def test_agreement_is_a_mean_over_the_way_and_not_over_the_readings():
     stamps = np.arange(0.0, 44.0, 0.1)
     x = np.where(stamps < 4.0, 2.5 * stamps, 10.0 + 0.25 * (stamps - 4.0))
     heading = np.where(stamps < 4.0, 0.0, np.pi / 4)
-    agreement, varied = heading_agreement(Odometry(stamps, np.column_stack([x, 0 * x, heading])))
+    agreement, straight = heading_agreement(Odometry(stamps, np.column_stack([x, 0 * x, heading])))
     # Two equal halves whose doubled angles are a right angle apart.
     assert agreement == pytest.approx(np.sqrt(0.5), abs=0.01)
-    assert not varied
+    assert straight == pytest.approx(1.0, abs=1e-6)
     short = heading_agreement(Odometry(stamps[:3], np.zeros((3, 3))))
-    assert short == (1.0, False)
+    assert short == (1.0, 1.0)
 
 
 @pytest.mark.parametrize("wrapped", [False, True])
@@ -143,10 +144,23 @@ def test_degrees_are_refused_and_radians_are_not(wrapped):
     degrees = (degrees + 180.0) % 360.0 - 180.0 if wrapped else degrees
     with pytest.raises(DataError, match=r"as such it agrees with the path to 1\.00 of 1, as radians to 0"):
         refuse_degrees(with_heading(path, degrees))
-    # A heading against the path is another fault; and one that hardly turns shows none.
+    # A heading against the path is another fault.
     for heading in (path.poses[:, 2], -path.poses[:, 2], 0.01 * degrees):
         refuse_degrees(with_heading(path, heading))
-    refuse_degrees(with_heading(arc(0.05), np.degrees(arc(0.05).poses[:, 2])))
+    with pytest.raises(DataError, match="looks like degrees"):
+        refuse_degrees(with_heading(arc(0.05), np.degrees(arc(0.05).poses[:, 2])))
+
+
+def test_degrees_show_in_small_turns_of_a_straight_path():
+    """As radians they are turns at random; a base that turns by itself along such a path shows no unit."""
+    stamps = np.arange(0.0, 100.0, 0.1)
+    heading = 0.04 * np.sin(0.2 * stamps)
+    path = Odometry(stamps, np.column_stack([np.cumsum(0.03 * np.cos(heading)), np.cumsum(0.03 * np.sin(heading)), heading]))
+    assert heading_reading(path).straight > 0.99
+    refuse_degrees(path)
+    with pytest.raises(DataError, match="looks like degrees"):
+        refuse_degrees(with_heading(path, np.degrees(heading)))
+    refuse_degrees(with_heading(path, 0.1 * stamps))
 
 
 def test_a_heading_against_a_path_that_swings_about_one_direction_is_not_in_degrees():

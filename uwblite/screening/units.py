@@ -30,7 +30,7 @@ _SELDOM, _OFTEN, _RAPID = 1.0, 0.005, 0.002
 _MOVES = 1e-6
 """m or rad; below it nothing moves."""
 _TURN_RATE = 3.0
-"""Mean turn rate, rad/s, that no robot keeps; a third of it is fast."""
+"""Mean turn rate, rad/s, that no robot keeps."""
 _PERIODS, _SPEEDS = (5e-4, 2.0), (0.01, IMPOSSIBLE)
 """Times between readings, s, and highest usual speeds, m/s, of a robot: what the right unit of time gives."""
 _AGREEMENT = 0.7
@@ -181,26 +181,26 @@ def likely_unit(times: float) -> str:
     return next((f"; {words}" for unit, words in units if times > 0.0 and abs(np.log(times / unit)) < _SAME_UNIT), "")
 
 
-def heading_agreement(odometry: Odometry, factor: float = 1.0) -> tuple[float, bool]:
+def heading_agreement(odometry: Odometry, factor: float = 1.0) -> tuple[float, float]:
     """Compare the heading times a factor with the direction of motion.
 
     Returns
     -------
     |mean exp(2 i (direction - factor heading))|, 1 for wheels that do not slide, forwards or backwards, near 0 for a wrong
-    unit or sign; and whether the path turns enough to decide.
+    unit or sign; and the same of a heading that stays: 1 for a straight path, which shows nothing.
     """
     xy, heading, way = odometry.poses[:, :2], np.unwrap(odometry.poses[:, 2]), odometry.travelled
     # A fifth of a metre at a time, or a part of a path whose unit is not known.
     piece = np.floor(way / min(0.2, max(float(way[-1]) / 100.0, TINY)))
     apart = np.flatnonzero(np.diff(piece, prepend=-1.0) > 0)
     if len(apart) <= _ENOUGH:
-        return 1.0, False
+        return 1.0, 1.0
     move = np.diff(xy[apart], axis=0)
     # As complex numbers: of squares the sign does not count.
     along = se2.as_complex(move) ** 2 / np.maximum(np.hypot(*move.T), np.finfo(float).tiny)
     weight, half = float(np.abs(along).sum()), 0.5 * (heading[apart[1:]] + heading[apart[:-1]])
     turned = along * se2.unit_complex(-2.0 * factor * half)
-    return float(np.abs(turned.sum())) / weight, bool(np.abs(along.sum()) < _STRAIGHT * weight)
+    return float(np.abs(turned.sum())) / weight, float(np.abs(along.sum())) / weight
 
 
 class HeadingReading(NamedTuple):
@@ -211,26 +211,33 @@ class HeadingReading(NamedTuple):
     """With the other sign."""
     degrees: float
     """As degrees, wrapped or not."""
-    sound: bool
-    """Whether the path does not turn enough to tell, or the heading is the path's as it stands."""
+    straight: float
+    """Of a heading that stays."""
+
+    @property
+    def sound(self) -> bool:
+        """Whether the path does not turn enough to tell, or the heading is the path's as it stands."""
+        return self.straight >= _STRAIGHT or self.plain >= _AGREEMENT
+
+    @property
+    def in_degrees(self) -> bool:
+        """Whether the heading is the path's as degrees only, and explains more than half of how that turns."""
+        others = max(self.plain, self.mirrored)
+        return others < _AGREEMENT and self.degrees > others + CLEARLY and 1.0 - self.degrees < 0.5 * (1.0 - self.straight)
 
 
 def heading_reading(odometry: Odometry) -> HeadingReading:
     """Return how the heading agrees with the path as it stands, with the other sign, and as degrees."""
-    plain, varied = heading_agreement(odometry)
+    plain, straight = heading_agreement(odometry)
     mirrored, radians = heading_agreement(odometry, -1.0)[0], np.radians(odometry.poses[:, 2])
     degrees = heading_agreement(Odometry(odometry.stamps, np.column_stack([odometry.poses[:, :2], radians])))[0]
-    return HeadingReading(plain, mirrored, degrees, not varied or plain >= _AGREEMENT)
+    return HeadingReading(plain, mirrored, degrees, straight)
 
 
 def refuse_degrees(odometry: Odometry) -> None:
     """Raise DataError where the odometry's heading is clearly in degrees."""
     reading = heading_reading(odometry)
-    turn, span = np.abs(np.diff(odometry.poses[:, 2])), np.diff(odometry.stamps)
-    turning = (turn > _MOVES) & (span > 0)
-    rate = float(np.median(turn[turning] / span[turning])) if turning.sum() >= _ENOUGH else 0.0
-    large = rate > _TURN_RATE / 3.0 or float(np.ptp(odometry.poses[:, 2])) > 2.0 * np.pi
-    if large and not reading.sound and reading.degrees > max(reading.plain, reading.mirrored) + CLEARLY:
+    if reading.in_degrees:
         raise DataError(
             f"the odometry's heading looks like degrees (as such it agrees with the path to {reading.degrees:.2f} of 1, as "
             f"radians to {reading.plain:.2f}); write radians into the log (`angle_unit=0.0174533`)"
