@@ -135,10 +135,22 @@ def test_names_exchanged_half_way_are_named():
     log = late_by(0.0)
     radio = log.ranges
     other = np.where((radio.stamps > 60.0) & (radio.anchor < 2), 1 - radio.anchor, radio.anchor)
-    (fact,) = explained_by_ranges(replace(log, ranges=replace(radio, anchor=other)))[1]
+    undone, (fact,) = explained_by_ranges(replace(log, ranges=replace(radio, anchor=other)))
     assert fact.kind == "exchanged-names"
     assert set(fact.figures["anchors"]) == set(radio.anchor_ids[:2])
     assert fact.figures["at"] == pytest.approx(60.0, abs=10.0)
+    assert fact.figures["undone"]
+    assert np.mean(undone.ranges.anchor == radio.anchor) > 0.98
+
+
+def test_names_exchanged_for_a_time_are_exchanged_back_twice():
+    log = late_by(0.0)
+    radio = log.ranges
+    while_exchanged = (radio.stamps > 40.0) & (radio.stamps < 75.0) & (radio.anchor < 2)
+    other = np.where(while_exchanged, 1 - radio.anchor, radio.anchor)
+    undone, facts = explained_by_ranges(replace(log, ranges=replace(radio, anchor=other)))
+    assert [fact.figures["undone"] for fact in facts] == [True, True]
+    assert np.mean(undone.ranges.anchor == radio.anchor) > 0.97
 
 
 def test_names_exchanged_on_a_path_that_drifts_are_no_fault_of_the_wheels():

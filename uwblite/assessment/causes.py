@@ -38,6 +38,8 @@ _BY_SCANS = _of(
     "poor-fit untied-parts unusual-calibration mirrored",
 )
 """What a map shows of a fault of lidar or wheels."""
+_CUT = _of(_PLACES, _BY_SCANS, "other-side drift path-displaced odometry-alone worse-than-parts")
+"""What a map shows of a path in parts that odometry does not connect."""
 _ALL = _of(_BY_RANGES, _BY_SCANS, "wheels-against-lidar carried wheels-stand-still")
 
 EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
@@ -46,9 +48,11 @@ EXPLAINS: Mapping[str, frozenset[str]] = MappingProxyType(
         "clock-set-back": _TIMES | _ALL,
         "scans-outside-odometry": _of(_TIMES, "no-lidar"),
         "late-ranges": _of(_BY_RANGES, "range-scatter path-displaced worse-than-parts drift ranges-outside-odometry"),
-        "exchanged-names": _of(_BY_RANGES, "worse-than-parts untied-parts"),
+        "exchanged-names": _of(_BY_RANGES, "worse-than-parts untied-parts carried"),
         "wheels-against-ranges": _BY_RANGES,
         "ranges-outside-odometry": _of(_TIMES, "no-ranges"),
+        "odometry-gap": _CUT,
+        "odometry-breaks": _CUT,
         "made-up-stamps": _TIMES,
         "stamps-of-receipt": _TIMES,
         "stamps-in-bursts": _TIMES,

@@ -93,7 +93,8 @@ class Explanation:
 
 
 def explained_by_ranges(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
-    """Return the recording with the radio's clock set right, where that explains its ranges best, and what explains them."""
+    """Return the recording with the radio's clock and the anchors' names set right, where that explains its ranges best, and
+    what explains them."""
     traces = _traces(log)
     if not traces:
         return log, []
@@ -109,33 +110,49 @@ def explained_by_ranges(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
         left = _at_moments(in_time, _traces(in_time), to_compare=True)
         # A clock that is off contradicts the path at many moments; set right, at fewer.
         if _most(left) <= _most(moments):
-            facts = _facts(_with_names_undone(in_time, left), in_time)
-            return in_time, [*delays, Fact.of(late.kind, **late.figures), *facts]
-    return log, [*delays, *_facts(_with_names_undone(log, moments), log)]
+            log, moments, delays = in_time, left, [*delays, Fact.of(late.kind, **late.figures)]
+    log, moments = _with_names_undone(log, moments)
+    return log, [*delays, *_facts(moments, log)]
 
 
 def _most(rows: Sequence[Explanation]) -> float:
     return max((row.log_odds for row in rows), default=-np.inf)
 
 
-def _with_names_undone(log: SensorLog, rows: list[Explanation]) -> list[Explanation]:
-    """Return the rows without those that the exchange of names explains: with the names exchanged back they are no more.
+def _with_names_undone(log: SensorLog, rows: list[Explanation]) -> tuple[SensorLog, list[Explanation]]:
+    """Return the recording with names exchanged back, and the rows without those that the exchange explains: they are gone.
 
     An exchange contradicts the path, too, at moments somewhat before it and after it, where it is on one side: what holds there
     of two explanations of the same readings shows in what either leaves.
     """
-    exchanges = [row for row in rows if row.names and row.log_odds > EvidencePolicy.very_strong]
-    for row in sorted(exchanges, key=lambda row: -row.log_odds):
-        ranges, near = log.ranges, [other for other in rows if other.meets(row)]
-        assert ranges is not None
-        at = np.interp(0.5 * (row.begin + row.end), log.odometry.travelled, log.odometry.stamps)
-        others = np.array([ranges.anchor_ids.index(row.names.get(name, name)) for name in ranges.anchor_ids], dtype=np.intp)
-        anchor = np.where(ranges.stamps > at, others[ranges.anchor], ranges.anchor)
-        undone = replace(log, ranges=replace(ranges, anchor=anchor))
+    tried = list[Explanation]()
+    while left := [row for row in rows if row.names and row.log_odds > EvidencePolicy.very_strong and row not in tried]:
+        row = max(left, key=lambda row: row.log_odds)
+        tried.append(row)
+        near, undone = [other for other in rows if other.meets(row)], _with_names_back(log, row)
         left = _at_moments(undone, _traces(undone), row, to_compare=True)
-        if row in rows and _most(left) < min(_most(near) - EvidencePolicy.very_strong, row.log_odds):
+        if _most(left) < min(_most(near) - EvidencePolicy.very_strong, row.log_odds):
+            row = replace(row, figures=row.figures | {"undone": True})
             rows, log = [row, *left, *(other for other in rows if other not in near)], undone
-    return rows
+            tried.append(row)
+    return log, rows
+
+
+def _with_names_back(log: SensorLog, row: Explanation) -> SensorLog:
+    """Return the recording with names exchanged back from the moment of a row's stretch on from which the ranges fit best."""
+    ranges, odometry = log.ranges, log.odometry
+    assert ranges is not None
+    others = np.array([ranges.anchor_ids.index(row.names.get(name, name)) for name in ranges.anchor_ids], dtype=np.intp)
+    best, most = log, -np.inf
+    for at in np.interp(np.arange(row.begin, row.end, PathPolicy.apart), odometry.travelled, odometry.stamps).tolist():
+        anchor = np.where(ranges.stamps > at, others[ranges.anchor], ranges.anchor)
+        other = replace(log, ranges=replace(ranges, anchor=anchor))
+        stretches = Stretches.of(_traces(other), np.array([row.begin]), np.array([row.end]))
+        # Of anchors with too few readings for a place these may be any numbers.
+        likely = float(stretches.likely.sum(axis=0).max() + np.log(ranges.ranges.max()) * stretches.counts.sum())
+        if likely > most:
+            best, most = other, likely
+    return best
 
 
 def _facts(rows: Sequence[Explanation], log: SensorLog) -> list[Fact]:
@@ -463,10 +480,10 @@ class Moment:
         if changed:
             # The number of cycles of so many of the anchors.
             gain -= math.lgamma(count + 1.0) - math.lgamma(count - len(changed) + 1.0) - math.log(len(changed))
-            yield Explanation(gain + prior, kind, {"exchanged": True, "anchors": changed}, names=names)
+            yield Explanation(gain + prior, kind, {"exchanged": True, "undone": False, "anchors": changed}, names=names)
         number = -float(np.log(self.longest))
         nowhere = max(float(a.likely.sum(axis=0).max() + number * b.counts.sum()) for a, b in ((one, two), (two, one)))
-        yield Explanation(nowhere + prior, kind, {"exchanged": False, "anchors": changed})
+        yield Explanation(nowhere + prior, kind, {"exchanged": False, "undone": False, "anchors": changed})
 
 
 _WHEELS = "wheels-against-ranges"
