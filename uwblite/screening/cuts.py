@@ -16,6 +16,7 @@ from ..findings import Fact
 from ..lidar.scan_odometry import directional_shares, in_free_space, scan_steps
 from ..sensor_log import Odometry, OdometryBreaks, SensorLog
 from . import range_motion
+from .units import FASTEST
 from .wheel_motion import show_motion, usual_period
 
 
@@ -196,11 +197,16 @@ def _changes(log: SensorLog) -> Floats:
 
 
 def _elsewhere(log: SensorLog, first: Ints, second: Ints) -> tuple[Bools, Floats]:
-    """Return which pairs of scans (e,) no motion near the wheels' brings together, and what share of them matches (e,)."""
+    """Return which pairs of scans (e,) no motion that a robot can make brings together, and what share of them matches (e,).
+
+    After a fast turn the scans overlap little, but the wheels' motion puts no surfaces before others.
+    """
     assert log.scans is not None
+    middle = log.scans.middles
     motion, share = _matched(log, first, second)
-    apart = share < CutPolicy.same_place
-    through = in_free_space(log.scans, log.mounting, first[apart], second[apart], motion[apart])
+    wheels, span = log.odometry.motion(middle[first], middle[second]), middle[second] - middle[first]
+    apart = (share < CutPolicy.same_place) | (np.hypot(*(motion - wheels)[:, :2].T) > FASTEST * span)
+    through = in_free_space(log.scans, log.mounting, first[apart], second[apart], wheels[apart])
     apart[apart] &= through > CutPolicy.through
     return apart, share
 
