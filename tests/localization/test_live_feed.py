@@ -1,5 +1,6 @@
 """Silence of sensors: late after the limit or three of their own periods, each by itself and all together."""
 
+import numpy as np
 import pytest
 from helpers.localization_room import known
 
@@ -74,3 +75,16 @@ def test_a_feed_without_data_says_so_once_ages_the_pose_and_goes_on():
     assert len([n for n in notes if "no data" in n]) == 1
     assert not list(feed.take(b"ODOM 0 0 0 0 0 0 30.0 h 20.0\n"))[-1].age
     assert "data come again" in notes
+
+
+def test_a_feed_without_odometry_says_after_its_patience_that_there_is_no_pose():
+    notes = []
+    feed = LiveFeed(known(), lambda mounting: mounting, notes.append)
+    ranges = "".join(f"UWB A1 3.0 0 {10 + 0.1 * k:.3f} h {10 + 0.1 * k:.3f}\n" for k in range(100)).encode()
+    states = list(feed.take(ranges))
+    told = [state for state in states if np.isfinite(state.stamp)]
+    assert all(state.lost for state in states)
+    assert [state.stamp for state in told] == pytest.approx([10 + 0.1 * k for k in range(61, 100)])
+    assert {state.reason for state in told} == {"no odometry has come in: without it there is no pose"}
+    assert notes.count("warning: nothing from odometry for 6 s; without it there is no pose") == 1
+    assert np.isfinite(list(feed.take(b"ODOM 0 0 0 0 0 0 20.0 h 20.0\n"))[-1].stamp)

@@ -28,6 +28,7 @@ _FIRST_PERIOD = 2.0
 """s, as long as a sensor's own is not known: that of a radio that measures at rest."""
 _FORGETTING = 0.05
 """Share of the longest period that every message forgets."""
+_NO_ODOMETRY = "no odometry has come in: without it there is no pose"
 _NAMED = 10
 """Most unknown anchors that are named."""
 
@@ -183,13 +184,16 @@ class LiveFeed:
         silent = self.silence.silent()
         for name in sorted(self._reported - set(silent)):
             self._note(f"{name} is back")
+        never = {} if "odometry" in self.silence.longest else {"odometry": "without it there is no pose"}
         for name in sorted(set(silent) - self._reported):
-            self._note(f"warning: nothing from {name} for {silent[name]:.0f} s; {CONSEQUENCES[name]}")
+            self._note(f"warning: nothing from {name} for {silent[name]:.0f} s; {(CONSEQUENCES | never)[name]}")
         self._reported = set(silent)
 
     def _aged(self, state: LocalizerState, quiet: float = 0.0) -> LocalizerState:
         """Return a state with the silence of the sensors, where nothing at all has come for so long, s."""
         silent = self.silence.silent(quiet)
+        if "odometry" in silent and not np.isfinite(state.stamp):
+            state = replace(state, stamp=self.silence.now, reason=_NO_ODOMETRY)
         if not quiet:
             return replace(state, silent=silent) if silent else state
         drift = np.diag(np.square(np.minimum(UNSEEN_SPEED * quiet, (np.inf, np.inf, np.pi))))
