@@ -1,6 +1,7 @@
 """Options in place of the settings and arguments that texts of the library name."""
 
 import argparse
+import inspect
 import re
 
 import pytest
@@ -8,7 +9,21 @@ from conftest import ROOT
 
 from uwblite.cli import VERBS, console
 from uwblite.cli.options import OPTIONS, name_options, name_options_in
+from uwblite.drivers.create2 import Create2Driver
+from uwblite.drivers.devices import DEVICES
+from uwblite.drivers.log_file import LogFile
+from uwblite.drivers.odometry_line import GyroLineDriver, OdometryLineDriver
+from uwblite.drivers.rplidar import RpLidarDriver
+from uwblite.drivers.scip_driver import ScipDriver
+from uwblite.evaluation.map import find_columns
+from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.findings import doubt
+from uwblite.graph.robust import Kernel
+from uwblite.io.formats import read_recording
+from uwblite.localization.live_feed import Patience
+from uwblite.navigation.planner import Planner, make_planner
+from uwblite.radio.anchor_planning import plan_anchors
+from uwblite.server.web import server_for
 
 
 @pytest.mark.parametrize(
@@ -155,3 +170,36 @@ def test_what_may_be_given_twice_keeps_both_in_their_order(verb):
                  for one in (first, second)]  # fmt: skip
         assert both == [*alone[0], *alone[1]]
         assert len(both) == 2
+
+
+OF_FUNCTIONS = [
+    ("evaluate", "max_gap", evaluate_trajectory, "max_gap"),
+    ("evaluate", "delta", evaluate_trajectory, "rpe_delta"),
+    ("evaluate", "search_radius", find_columns, "search_radius"),
+    ("plan", "step", Planner.plan, "step"),
+    ("plan", "unknown", make_planner, "unknown"),
+    ("plan-anchors", "reach", plan_anchors, "reach"),
+    ("localize", "late", Patience, "late"),
+    ("localize", "lost_after", Patience, "lost"),
+    ("optimize", "kernel", Kernel, "name"),
+    ("view", "port", server_for, "port"),
+    ("watch", "host", server_for, "host"),
+    ("record", "sync", LogFile, "sync"),
+    ("record", "rotate", LogFile, "rotate"),
+    ("map", "every_nth_scan", read_recording, "every_nth_scan"),
+]
+
+
+@pytest.mark.parametrize(("verb", "name", "function", "argument"), OF_FUNCTIONS)
+def test_what_is_not_given_is_the_same_on_the_command_line_and_in_the_library(verb, name, function, argument):
+    default = inspect.signature(function).parameters[argument].default
+    assert parser_of(verb).parse_known_args([])[0].__dict__[name] == default
+
+
+@pytest.mark.parametrize(
+    ("name", "driver"),
+    [("line", OdometryLineDriver), ("gyro-line", GyroLineDriver), ("create2", Create2Driver), ("scip", ScipDriver),
+     ("rplidar", RpLidarDriver)],
+)  # fmt: skip
+def test_a_driver_that_is_made_without_a_speed_has_that_of_its_option(name, driver):
+    assert inspect.signature(driver).parameters["baud"].default == DEVICES[name].options["baud"].default

@@ -5,12 +5,14 @@ YDLidar-SDK; RPLIDAR interface protocol and data sheets; hls_lfcd_lds_driver; nl
 """
 
 import math
+import re
 
 import pytest
 
 from uwblite.drivers import create2, dwm1001_tlv, kobuki, ldlidar, lds01, rplidar, ydlidar
 from uwblite.drivers.devices import DEVICES, Setup, kinds_on_usb
 from uwblite.drivers.scip_commands import BAUD_RATES, NOTHING_SEEN, Geometry, ScanRequest
+from uwblite.errors import ConfigError
 
 BAUDS = {
     "kobuki": 115200, "create2": 115200, "line": 115200, "gyro-line": 115200, "tlv": 115200, "shell": 115200,
@@ -95,3 +97,56 @@ def test_a_module_is_asked_in_the_words_of_its_guide():
     }  # fmt: skip
     assert {name: getattr(dwm1001_tlv, name).hex() for name in words} == words
     assert [dwm1001_tlv.ERRORS[k].split()[0] for k in range(6)] == ["ok", "unknown", "internal", "invalid", "busy", "not"]
+
+
+SILENT = {
+    "kobuki": "switch it on", "create2": "press its power button", "tlv": "the USB bridge of the DEV board can hang",
+    "scip": "check its 5 V supply", "ld06": "PWM wire must lie on ground",
+}  # fmt: skip
+"""What makers and users found to be the cause."""
+
+
+@pytest.mark.parametrize("name", DEVICES)
+def test_a_device_that_is_silent_is_mended_as_its_maker_says_or_by_its_power_and_cable(name):
+    assert SILENT.get(name, "check its power and its cable") in DEVICES[name].silent
+
+
+def test_options_that_are_not_given_change_nothing():
+    """Scans all and whole, texts as they are, units of metres, radians and seconds; a number has limits that hold it."""
+    defaults = {
+        "steps": "", "cluster": 1, "skip": 0, "narrow": 0, "standard": 0, "tick": 0.0, "wheel_base": 0.0, "tick_modulus": 0,
+        "time_unit": 1.0, "length_unit": 1.0, "angle_unit": 1.0, "unit": 1.0, "prefix": "", "tag": "",
+    }  # fmt: skip
+    for kind in DEVICES.values():
+        for name, option in kind.options.items():
+            assert name in ("columns", "baud") or option.default == defaults[name], f"{kind.name} {name}"
+            assert option.bounds is None or option.bounds[0] <= option.default <= option.bounds[1]
+    columns = {name: kind.options["columns"].default for name, kind in DEVICES.items() if "columns" in kind.options}
+    assert columns == {"line": "t,x,y,theta", "gyro-line": "turn_rate", "uwb-line": "id,range"}
+    scip = DEVICES["scip"].driver
+    assert scip({}, Setup())._scans == ScanRequest()
+    given = scip({"steps": "128:640", "cluster": "2", "skip": "3", "narrow": "1"}, Setup())._scans
+    assert given == ScanRequest(128, 640, 2, 3, wide=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "taken", "refused"),
+    [
+        ("scip", "cluster", ["1", "99"], ["0", "100", "1.5"]),
+        ("scip", "skip", ["0", "9"], ["-1", "10"]),
+        ("scip", "narrow", ["0", "1"], ["2"]),
+        ("scip", "steps", ["", "0:9999", "7:7"], ["8:7", "0:10000", "7", "a:b"]),
+        ("scip", "baud", ["1200", "4000000"], ["1199", "4000001"]),
+        ("uwb-line", "unit", ["1e-6", "1e3"], ["0", "1e-7", "1001", "-1"]),
+        ("line", "time_unit", ["1e-12"], ["0", "-1"]),
+        ("line", "length_unit", ["1e-12", "-0.5"], ["0"]),
+        ("gyro-line", "angle_unit", ["-0.0175"], ["0", "nan"]),
+        ("rplidar", "standard", ["0", "1"], ["2"]),
+    ],
+)
+def test_options_are_taken_up_to_their_limits(name, option, taken, refused):
+    for value in taken:
+        DEVICES[name].driver({option: value}, Setup())
+    for value in refused:
+        with pytest.raises(ConfigError, match=f"{option}={re.escape(value)} is not "):
+            DEVICES[name].driver({option: value}, Setup())

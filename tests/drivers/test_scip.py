@@ -371,3 +371,11 @@ def test_a_time_that_is_damaged_is_none(line):
     good_line = encode(16000000, 4) + bytes([scip.checksum(encode(16000000, 4))])
     assert feed_whole(ScipProtocol, frame("TM1", "00", good_line)) == [Reply(1.0, "TM1", "00", ("16000000",))]
     assert feed_whole(ScipProtocol, frame("TM1", "00", line)) == [Corrupt("time with a wrong sum")]
+
+
+def test_bytes_that_are_no_text_are_replaced_wherever_a_unit_prints_text():
+    """Also behind an empty line in the middle of its answer."""
+    data = frame("VV", "00", b"VEND:Hok\xffuyo;x") + b"SERI:H\xfe12;x\n\n"
+    assert feed_whole(ScipProtocol, data) == [
+        Reply(1.0, "VV", "00", ("VEND:Hok\ufffduyo",)), Reply(1.0, "VV", "00", ("SERI:H\ufffd12",)),
+    ]  # fmt: skip
