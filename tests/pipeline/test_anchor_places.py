@@ -1,6 +1,7 @@
 """Where anchors stood and when: planted moves are found and told, sound anchors of a torn path are not."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from uwblite.graph.pose_edges import ScanEdges
 from uwblite.loop_closure.closures import no_closures
 from uwblite.mapping import build_map
 from uwblite.odometry.keyframes import KeyframeConfig
-from uwblite.pipeline.anchor_places import _names, decide_places
+from uwblite.pipeline.anchor_places import _moves, _names, decide_places
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.joining import _one_graph
 from uwblite.pipeline.mapping_config import MappingConfig
@@ -230,3 +231,29 @@ def test_an_estimate_without_ranges_stays():
     estimate, task = planted(metres=5.0)
     estimate = replace(estimate, ranges=None)
     assert decide_places(estimate, task) is estimate
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_each_change_of_place_is_told_with_its_times_its_way_and_the_ranges_meanwhile(several):
+    """Within a recording from when to when, between recordings without times."""
+    log = SimpleNamespace(odometry=SimpleNamespace(stamps=np.array([10.0, 90.0])))
+    later = SimpleNamespace(odometry=SimpleNamespace(stamps=np.array([200.0, 290.0])))
+    recordings = [SimpleNamespace(log=log), *([SimpleNamespace(log=later)] if several else [])]
+
+    class Recordings(SimpleNamespace):
+        def __len__(self):
+            return len(self.each)
+
+    task = SimpleNamespace(recordings=Recordings(each=recordings))
+    place = np.array([-1, 0, 0, -1, -1, 1, 1, 0])
+    stamps = np.array([11.0, 12.0, 13.0, 14.0, 15.0, 16.0, 17.0, 201.0])
+    recording = np.array([0] * 7 + [int(several)])
+    positions = np.array([[0.0, 0.0], [3.0, 4.0]])[place]
+    names = ["A", "A@2"]
+    first, second = _moves(task, positions, place, names, stamps, recording)
+    assert (first.kind, first.figures) == (
+        "moved-anchor",
+        {"anchor": "A", "distance": 5.0, "recording": 1, "new_id": "A@2", "between": [4.0, 6.0, 2], "several": several},
+    )
+    told = {"anchor": "A@2", "distance": 5.0, "recording": 1 + several, "new_id": "A"}
+    assert second.figures == told | ({} if several else {"between": [191.0, 191.0, 0], "several": False})

@@ -366,7 +366,8 @@ def moved_anchor(
 ) -> Finding:
     """Warn of an anchor that stands elsewhere from some time on, in another recording, or than in an earlier map.
 
-    `between` holds the last time at the one place, the first at the other, s, and the number of ranges meanwhile.
+    `between` holds the times of the first range that is no longer from the one place and of the first from the other, s, and
+    the number of ranges meanwhile, which are from neither.
     """
     if not recording:
         text = f"anchor {anchor} stands {distance:.2f} m from its earlier place: it was moved"

@@ -56,7 +56,7 @@ def _comparisons(args: argparse.Namespace, folder: Path) -> Iterator[tuple[str, 
         yield "relations", *_relations(folder, args.relations, first)
     if not args.truth:
         return
-    recordings = [_recording(folder, truth, number) for number, truth in enumerate(args.truth, first)]
+    recordings = [_paired(folder, truth, number) for number, truth in enumerate(args.truth, first)]
     together, several = Paired.one_after_another(recordings), len(recordings) > 1
     trajectory = evaluate_trajectory(*together, max_gap=args.max_gap, rpe_delta=args.delta)
     yield "trajectory", *_shown_trajectory(trajectory, len(together.true_stamps), "together" if several else "trajectory")
@@ -99,7 +99,8 @@ def _relations(folder: Path, path: str, number: int) -> Shown:
     return _shown_relations(errors, result.laser_delay)
 
 
-def _recording(folder: Path, truth: str, number: int) -> Paired:
+def _paired(folder: Path, truth: str, number: int) -> Paired:
+    """Return the trajectory of a recording, counted from 1, in a folder of a result, and its truth."""
     estimate = folder / ("trajectory.tum" if number == 1 else f"trajectory_{number}.tum")
     if number > 1 and folder.is_dir() and not estimate.exists():
         raise ConfigError(f"{folder} has no {estimate.name}: it is a map of fewer recordings")

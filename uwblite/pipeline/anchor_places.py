@@ -138,11 +138,12 @@ def _names(radio: str, place: Ints, recording: Ints) -> list[str]:
 
 
 def _moves(task: Task, positions: Floats, place: Ints, names: Sequence[str], stamps: Floats, recording: Ints) -> Iterator[Fact]:
-    """Tell of each change of a radio's place.
+    """Tell of each change of a radio's place, from the last range at the one to the first at the other.
 
     Parameters
     ----------
-    positions, place, stamps, recording : (m, 2) m, (m,), (m,) s, (m,) of its ranges in the order of time.
+    positions : (m, 2) m, of the place that each of its ranges is from, in the order of time.
+    place, stamps, recording : (m,) number of that place, -1 = none; (m,) s; (m,) from 0.
     names : of its places.
     """
     placed = np.flatnonzero(place >= 0)
