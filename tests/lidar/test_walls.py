@@ -1,5 +1,7 @@
 """Straight pieces of single scans; which pieces of many scans are one wall, and the rays on them."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from helpers.wall_rays import seen
@@ -210,3 +212,20 @@ def test_a_grazed_wall_and_one_of_vague_direction_are_no_pieces(wall, noise, cou
     """Readings at a grazing angle err; a narrow post seen by a bad lidar shows no direction."""
     pieces, _ = straight_pieces(seen(wall, np.zeros((1, 3)), noise, beams=2880, reach=6.0))
     assert len(pieces.length) == count
+
+
+@pytest.mark.parametrize("moved", [[0.3, -0.2, 0.0], [-2.0, 5.0, 2.0]])
+def test_pieces_do_not_depend_on_the_frame_of_the_rays(moved):
+    """The laser sits anywhere on the robot, and moves while it turns: noise goes by the lengths of rays."""
+    rays = seen([[-3.0, 2.0, 3.0, 2.5], [3.0, 2.5, 3.0, -2.0]], np.zeros((1, 3)), 0.008)
+    pieces, on = straight_pieces(rays)
+    T = np.array(moved)
+    there = dataclasses.replace(rays, points=se2.transform(T, rays.points), origins=se2.transform(T, rays.origins))
+    again, on_again = straight_pieces(there)
+    assert len(pieces.length) >= 2
+    np.testing.assert_allclose(again.centre, se2.transform(T, pieces.centre), atol=1e-6)
+    np.testing.assert_allclose(again.normal, se2.rotate(T[2], pieces.normal), atol=1e-6)
+    np.testing.assert_allclose(again.deviation, pieces.deviation, rtol=1e-5)
+    np.testing.assert_allclose(again.length, pieces.length, atol=1e-6)
+    np.testing.assert_allclose(on_again.sigma, on.sigma, rtol=1e-5)
+    np.testing.assert_array_equal(on_again.surface, on.surface)

@@ -548,3 +548,19 @@ def test_garbage_among_the_measurements_changes_nothing(drive):
     odd.localizer.add_odometry(99.5, np.nan, 0.0, 0.0)
     again = odd.along(poses[:30])
     np.testing.assert_allclose(again[-1].pose, states[29].pose, atol=0.02)
+
+
+def test_a_robot_that_is_tracked_without_doubt_searches_nothing_and_a_lost_one_twice_a_second(monkeypatch):
+    poses, drive, begun = path(ROUND)[:75], robot(known(anchors={})), []
+    begin, start = PlaceSearch.begin, drive.stamp
+
+    def noted(search, *words):
+        begun.append(drive.stamp - start)
+        begin(search, *words)
+
+    monkeypatch.setattr(PlaceSearch, "begin", noted)
+    # s, of a state each fifth of a second.
+    found = 0.2 * first_found(drive.along(poses, ranges=False))
+    assert found < 12.0
+    assert 2 <= sum(when <= found for when in begun) <= 1 + 2 * found
+    assert not [when for when in begun if when > found + 0.1]
