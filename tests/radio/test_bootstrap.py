@@ -331,3 +331,19 @@ def test_equal_inputs_give_equal_bytes():
     one, other = start(wheels, radio)[0], start(wheels, radio)[0]
     assert one.graph.poses.tobytes() == other.graph.poses.tobytes()
     assert one.graph.anchors.tobytes() == other.graph.anchors.tobytes()
+
+
+def test_a_slip_is_sought_from_either_end_of_a_burst(monkeypatch):
+    """Where the pose is known before it, and where it is known behind it."""
+    asked, slipping = [], Attempt.slipping
+
+    def noted(attempt, low, high, *, forward):
+        asked.append((low, high, forward))
+        return slipping(attempt, low, high, forward=forward)
+
+    monkeypatch.setattr(Attempt, "slipping", noted)
+    attempt = slipping_over_four_steps()
+    of_likeliest_slips(attempt.with_slips(attempt.slips))
+    ends = {span[:2] for span in asked}
+    assert ends
+    assert set(asked) == {(*span, forward) for span in ends for forward in (True, False)}
