@@ -199,4 +199,5 @@ def test_a_large_map_gets_coarser_cells():
     assert room.cell > 0.1
     # Four million, and a rim for the coarsest level on every side.
     assert room.levels[0].size <= (np.sqrt(4e6) + 2 * 2 ** (LEVELS + 1) + 2) ** 2
+    assert room.levels[0].size > 4e6, "no coarser than it must be"
     assert not room.levels[0].any()

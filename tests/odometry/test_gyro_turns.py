@@ -105,3 +105,16 @@ def test_until_a_gyro_has_been_compared_for_15_s_the_wheels_turn(begin):
     stamps, truth, wheels = drive(seconds=30.0)
     early = stamps - stamps[0] < 14.0
     np.testing.assert_allclose(along(stamps + begin, truth, wheels, 2.0)[early], wheels[early], atol=1e-9)
+
+
+def test_readings_that_come_late_twice_or_are_no_numbers_change_nothing():
+    stamps, truth, wheels = drive(seconds=40.0)
+    odd = [(-1.0, 9.0), (0.0, 9.0), (np.nan, 1.0), (0.01, np.nan), (np.inf, 1.0)]
+    sound, among = GyroTurns(), GyroTurns()
+    for stamp, pose, heading in zip(stamps, wheels, np.unwrap(truth[:, 2]), strict=True):
+        for turns, others in ((sound, []), (among, odd)):
+            turns.add(stamp, heading)
+            for later, value in others:
+                turns.add(stamp + later, value)
+        np.testing.assert_array_equal(sound.turned(stamp, pose), among.turned(stamp, pose))
+    assert len(sound._stamps) == len(among._stamps) > 100
