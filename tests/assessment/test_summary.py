@@ -375,3 +375,25 @@ def test_the_table_of_ranges_says_where_each_was_taken():
         [1, 0, 1],
         [0, 2, 1],
     ]
+
+
+@pytest.mark.parametrize(
+    ("many", "by", "limit", "status"),
+    [
+        (4, 0.51, 0.2, "distrusted"),
+        (3, 0.51, 0.2, "ok"),
+        (4, 0.49, 0.2, "ok"),
+        (4, 0.51, 0.6, "ok"),
+        (4, 0.61, 0.6, "distrusted"),
+    ],
+)
+def test_ranges_are_too_short_by_half_a_metre_or_by_what_noise_allows(many, by, limit, status):
+    """More than three of them, and more than one in twenty."""
+    short = np.arange(60) < many
+    ranges = plain_ranges(np.zeros(60, int), np.zeros(60, int), np.where(short, 5.0 - by, 5.0), 0.1)
+    ranges = replace(ranges, calibration=np.full((60, 6), -1))
+    graph = Graph(np.zeros((1, 3)), np.array([[3.0, 4.0]]))
+    no = np.zeros(1, dtype=bool)
+    estimate = Estimate(graph, None, ranges, ("A",), BootstrapResult(None, ~no, ((),), no))
+    covariance = covariances([1e-4 * np.eye(2)], [])
+    assert _anchor(0, estimate, None, covariance, np.where(short, -by, 0.0), limit).status == status

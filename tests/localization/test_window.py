@@ -46,3 +46,16 @@ def test_a_robot_that_has_gone_as_far_as_counts_keeps_both_scans():
     assert not window.wants_look(module._STANDING, 60.0)
     window.add_look(look(module._STANDING, 60.0))
     assert [kept.stamp for kept in window.looks] == [5.0, 60.0]
+
+
+def test_rays_are_those_of_the_last_metres_with_their_age_up_to_the_length_itself():
+    window = Window()
+    for way in (0.0, 0.5, 4.0, 4.5):
+        rays = Rays(np.array([[way, 1.0]]), np.zeros((1, 2)), np.ones(1, bool))
+        window.add_look(WindowLook(rays, np.array([way, 0.0, 0.0]), way, way))
+    rays, ages = window.seen(np.array([4.5, 0.0, 0.0]), 4.5, 4.0)
+    assert ages.tolist() == [4.0, 0.5, 0.0]
+    np.testing.assert_allclose(rays.ends, [[-3.5, 1.0], [3.5, 1.0], [4.5, 1.0]])
+    np.testing.assert_allclose(rays.origins, [[-4.0, 0.0], [-0.5, 0.0], [0.0, 0.0]])
+    none, ages = window.seen(np.zeros(3), 99.0, 4.0)
+    assert len(none.hit) == len(ages) == 0

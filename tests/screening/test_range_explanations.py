@@ -9,7 +9,7 @@ from helpers import planted
 
 from uwblite import se2
 from uwblite.arrays import CHUNK
-from uwblite.screening.range_explanations import Stretches, _best_order, _best_place, _traces, explained_by_ranges
+from uwblite.screening.range_explanations import Explanation, Stretches, _best_order, _best_place, _traces, explained_by_ranges
 from uwblite.sensor_log import Odometry, SensorLog
 
 CORNERS = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
@@ -259,3 +259,14 @@ def test_the_best_order_of_anchors_is_that_of_all(count):
         best = _best_order(pairs)
         assert sorted(best.tolist()) == list(range(count))
         assert pairs[range(count), best].sum() == pytest.approx(max(pairs[range(count), order].sum() for order in every))
+
+
+def test_an_explanation_without_a_stretch_of_its_own_meets_every_other_one():
+    whole = Explanation(1.0, "late-ranges", {})
+    for begin, end in ((0.0, 0.5), (0.5, 2.0), (90.0, np.inf)):
+        other = Explanation(1.0, "clock-jump", {}, begin, end)
+        assert whole.meets(other)
+        assert other.meets(whole)
+    first, second = (Explanation(1.0, "clock-jump", {}, *span) for span in ((0.0, 2.0), (2.0, 3.0)))
+    assert not first.meets(second)
+    assert not second.meets(first)
