@@ -5,7 +5,7 @@ import random
 import pytest
 
 from uwblite.clocks.clock_map import MAX_SKEW, ClockMap
-from uwblite.clocks.device_clock import DeviceClock, Unwrapper
+from uwblite.clocks.device_clock import WITNESSES, DeviceClock, Unwrapper
 
 
 @pytest.mark.parametrize(("modulus", "tick"), [(1 << 24, 1e-3), (1 << 16, 1e-3)])
@@ -175,3 +175,18 @@ def test_a_stamp_is_known_to_the_tie_half_a_count_and_twice_what_the_quickest_fr
     assert alone.excess > 5e-4
     assert reading.spread == pytest.approx(clock.tied + 0.5 * tick + 2.0 * alone.excess)
     assert abs(reading.stamp - 100.0 - 0.1 * 399) < reading.spread
+
+
+def test_a_wrong_pace_is_believed_when_it_is_seen_several_times_in_a_row():
+    """Between right ones it is the host that stood still."""
+    clock = DeviceClock(1.0, proven=False)
+    for _ in range(5):
+        for rate in (*[1.5] * (WITNESSES - 1), 1.0):
+            clock._judge(rate)
+            assert clock.rate is None
+    assert clock.proven
+    for seen in range(1, WITNESSES + 1):
+        clock._judge(1.5)
+        assert (clock.rate == 1.5) is (seen == WITNESSES)
+    clock._judge(1.0)
+    assert clock.rate is None

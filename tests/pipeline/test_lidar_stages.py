@@ -132,3 +132,17 @@ def test_pairs_of_one_visit_do_not_lead_across_a_step_that_clouds_measure_falsel
     across = {(i, j) for i, j in every if i <= false < j}
     assert every - kept == {(i, j) for i, j in across if j - i <= near} != set()
     assert any(j - i > near for i, j in across)
+
+
+def test_a_scan_between_keyframes_is_placed_by_the_cloud_of_the_farther_one():
+    """That of the nearer one may hold the scan itself."""
+    _, _, one, after, _ = scans_placed_between(0.05, 5.0)
+    own, between = one.frames.stamps, after.between
+    inside = ~np.isin(between.frames.stamps, own)
+    stamps, keyframe = between.frames.stamps[inside], between.keyframe[inside]
+    step = np.searchsorted(own, stamps) - 1
+    nearer_to_the_first = stamps - own[step] < own[step + 1] - stamps
+    assert len(stamps) > 10
+    assert 0 < nearer_to_the_first.sum() < len(stamps)
+    even = np.isclose(stamps - own[step], own[step + 1] - stamps)
+    np.testing.assert_array_equal((keyframe - step)[~even], nearer_to_the_first[~even].astype(int))
