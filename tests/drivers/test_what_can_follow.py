@@ -6,10 +6,12 @@ from dataclasses import replace
 import pytest
 
 from uwblite.drivers.continuity import LinkHealth, RangeGuard, device_time
+from uwblite.drivers.devices import open_device
 from uwblite.drivers.events import Corrupt, GyroHeading, OdometryPose, RangeEpoch, RangeReading
 from uwblite.drivers.kobuki import TICK, Feedback, _follows
 from uwblite.drivers.odometry_line import GyroLineDriver, LineFormat, OdometryLineDriver, gyro_format
 from uwblite.drivers.text_lines import Line
+from uwblite.drivers.uwb_line import Ranges
 
 PACKET = Feedback(10.0, 1000, 100, 100, 0.5, 0.0, 0, 15.0)
 
@@ -138,3 +140,21 @@ def test_a_link_counts_as_damaged_for_a_minute():
     assert not health.is_damaged(0.0)
     health.damage(100.0)
     assert [health.is_damaged(t) for t in (100.0, 159.9, 160.0)] == [True, True, False]
+
+
+@pytest.mark.parametrize(("pause", "missed"), [(2.3, 22), (1.05, 22), (0.95, 0), (0.1, 0)])
+def test_numbers_of_rounds_that_wrap_leap_no_faster_than_twice_as_fast_as_they_are_counted(pause, missed):
+    """Else the board has restarted: 23 rounds on, of ten a second; what is lost shows in the round behind the leap."""
+    driver = open_device("uwb", "makerfabs-at:/dev/tag")[0].driver
+    found = [driver._missed(Ranges(round=240 + k, modulus=256), 10.0 + 0.1 * k) for k in range(11)]
+    assert not any(found)
+    assert driver._missed(Ranges(round=(250 + 23) % 256, modulus=256), 11.0 + pause) == 0
+    assert driver._missed(Ranges(round=(250 + 24) % 256, modulus=256), 11.1 + pause) == missed
+
+
+@pytest.mark.parametrize(("following", "missed"), [(1, 9), (3, 9), (4, 0)])
+def test_a_leap_of_rounds_is_believed_when_one_of_the_next_three_follows(following, missed):
+    driver = open_device("uwb", "dwm3001:/dev/tag")[0].driver
+    numbers = [5, 6, 7, 17, 17 + following]
+    found = [driver._missed(Ranges(round=number), 10.0 + 0.1 * k) for k, number in enumerate(numbers)]
+    assert found == [0, 0, 0, 0, missed]
