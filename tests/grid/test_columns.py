@@ -101,3 +101,11 @@ def test_a_third_of_the_circle_is_too_little(share, is_found):
 def test_of_two_columns_that_look_alike_the_nearer_one_is_taken():
     both = np.concatenate([circle((1.5, -1.0), 0.25), circle((2.6, -1.0), 0.25)])
     np.testing.assert_allclose(find_columns(both, expected((2.0, -1.0))).positions, [(1.5, -1.0)], atol=1e-3)
+
+
+def test_two_cells_fix_no_circle_and_three_do():
+    centre, radius = np.array([1.0, 2.0]), 0.3
+    angle = np.array([0.3, 1.5, 4.0])
+    rim = centre + np.array([0.05, 0.0]) + radius * np.column_stack([np.cos(angle), np.sin(angle)])
+    np.testing.assert_array_equal(fit_circle(rim[:2], centre, radius, 0.2), centre)
+    assert np.hypot(*(fit_circle(rim, centre, radius, 0.2) - centre - [0.05, 0.0])) < 0.005

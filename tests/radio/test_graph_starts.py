@@ -19,6 +19,7 @@ from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
 from uwblite.io.graph_file import chained_poses
 from uwblite.io.pyfg import read_pyfg, write_pyfg
+from uwblite.radio import graph_starts
 from uwblite.radio.graph_starts import (
     Start,
     _places,
@@ -259,3 +260,13 @@ def test_the_best_places_of_a_chain_are_few_and_apart_the_cheapest_first(straigh
     assert (costs[1] < 1.01 * costs[0]) is straight
     ((cost, place),) = _places(anchors[:3], path[:3], ranges[:3])
     assert (cost, place.tolist()) == (0.0, [0.0] * 3)
+
+
+def test_places_of_a_chain_that_differ_by_a_decimetre_or_a_tenth_of_a_radian_are_two(monkeypatch):
+    """The best comes first, and of those that are one it stays."""
+    motions = [[0.0, 0.0, 0.0], [0.09, 0.0, 0.0], [0.11, 0.0, 0.0], [0.0, 0.0, 0.09], [0.0, -0.11, 0.0], [0.0, 0.0, 0.11]]
+    found = [(float(k), np.array(motion), None) for k, motion in enumerate(motions)]
+    monkeypatch.setattr(graph_starts, "path_placements", lambda *_: iter(found))
+    places = graph_starts._places(np.zeros((4, 2)), np.zeros((4, 2)), np.ones(4))
+    assert [cost for cost, _ in places] == [0.0, 2.0, 4.0, 5.0]
+    assert [cost for cost, _ in graph_starts._places(np.zeros((3, 2)), np.zeros((3, 2)), np.ones(3))] == [0.0]

@@ -278,3 +278,17 @@ def test_factors_that_a_unit_explains():
     assert "ranges in yards" in likely_unit(1.10)
     assert "odometry in feet" in likely_unit(0.31)
     assert likely_unit(1.0) == likely_unit(1.15) == likely_unit(1.41) == likely_unit(-0.31) == ""
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("feet", 0.3048), ("centimetres", 0.01), ("millimetres", 0.001)])
+def test_ranges_that_change_as_fast_as_in_another_unit_are_refused_unless_the_lidar_agrees(unit, metres):
+    """To a fifth: wheels have errors of their own."""
+    for off in (1.0, 1.19, 1.0 / 1.19):
+        with pytest.raises(DataError, match=rf"the ranges look like {unit}.*`range_unit={metres:g}`"):
+            refuse_other_ranges(off / metres, np.nan)
+        refuse_other_ranges(off / metres, 1.0 / metres)
+    for off in (1.21, 1.0 / 1.21):
+        refuse_other_ranges(off / metres, np.nan)
+    with pytest.raises(DataError):
+        refuse_other_ranges(1.0 / metres, 1.21 / metres)
+    refuse_other_ranges(1.0, np.nan)
