@@ -8,7 +8,7 @@ from helpers.localization_room import ANCHORS, EVEN, ODD, ROUND, SCANNER, cast, 
 
 from uwblite import se2
 from uwblite.errors import DataError
-from uwblite.localization import Localizer, Scanner
+from uwblite.localization import Localizer, Scanner, hypotheses
 from uwblite.localization.comparison import PlaceSearch
 from uwblite.localization.known_map import from_result
 from uwblite.localization.pose_estimator import PoseEstimator
@@ -564,3 +564,21 @@ def test_a_robot_that_is_tracked_without_doubt_searches_nothing_and_a_lost_one_t
     assert found < 12.0
     assert 2 <= sum(when <= found for when in begun) <= 1 + 2 * found
     assert not [when for when in begun if when > found + 0.1]
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_of_two_places_scans_tell_the_right_one(first):
+    """The other one is a metre aside, and as likely before."""
+    poses, drive = path(ROUND)[:43], robot(known())
+    assert not drive.along(poses[:40])[-1].lost
+    estimator = drive.localizer._estimator
+    (pose,), (covariance,) = estimator._bank.poses, estimator._bank.pose_covariances
+    places = np.array([pose, pose + np.array([0.7, 0.7, 0.0])])[[first, 1 - first]]
+    biases = estimator.known.anchors.bias_sigma
+    estimator._bank = hypotheses.started(places, np.array([covariance] * 2), biases)
+    drive.along(poses[40:], ranges=False)
+    off = np.hypot(*(estimator._bank.poses - poses[-1])[:, :2].T)
+    right = off < 0.2
+    assert right.any()
+    assert estimator._bank.log_weight[right].max() == 0.0
+    assert estimator._bank.log_weight[~right].max(initial=-np.inf) < -5.0
