@@ -96,3 +96,11 @@ def test_a_pose_is_known_while_its_longest_axis_is_short_in_any_frame():
         axes = np.array([[c, -t, 0.0], [t, c, 0.0], [0.0, 0.0, 1.0]])
         assert vague(axes @ np.diag([0.39**2, 0.01, 0.2**2]) @ axes.T) == ""
         assert "0.5 m" in vague(axes @ np.diag([0.48**2, 0.01, 0.2**2]) @ axes.T)
+
+
+def test_ranges_outweigh_scans_of_moved_furniture_and_staying_does_not():
+    """Half of a hall's furniture was moved: scans -10, ranges of four anchors +11 after six metres."""
+    assert is_certain(odds(scans=-10.3, ranges=11.4, agreed=9.4))
+    for agreed in (0.0, 9.4, 100.0):
+        assert "scans" in odds(scans=-10.3, ranges=8.6, agreed=agreed).nowhere
+        assert "ranges" in odds(scans=20.0, ranges=-6.1, agreed=agreed).nowhere

@@ -90,7 +90,9 @@ def _scan_lines(r: Recording) -> Iterator[bytes]:
     model, (mx, my, mt) = r.settings.laser, r.settings.laser_pose
     span = (model.beams - 1) * model.increment
     head = f"ROBOTLASER1 2 {model.angles[0]:.9f} {span:.9f} {model.increment:.9f} {model.max_range:.3f} 0.01 0 {model.beams} "
-    words = np.frombuffer("".join(f"{mm / 1000:.3f} " for mm in range(int(model.max_range * 1000) + 1)).encode(), dtype="S6")
+    wide = len(f"{model.max_range:.3f}")
+    text = "".join(f"{mm / 1000:{wide}.3f} " for mm in range(int(model.max_range * 1000) + 1))
+    words = np.frombuffer(text.encode(), dtype=f"S{wide + 1}")
     c, s = np.cos(r.scan_poses[:, 2]), np.sin(r.scan_poses[:, 2])
     x, y = r.scan_poses[:, 0], r.scan_poses[:, 1]
     where = np.column_stack(

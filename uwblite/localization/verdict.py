@@ -106,9 +106,10 @@ class Odds:
     def nowhere(self) -> str:
         """Why even this place is likelier to be in another building; "" = it is not.
 
-        What scans or ranges say against it by themselves, 400 : 1, the others do not outweigh: aisles are alike.
+        What ranges say against it by themselves, 400 : 1, nothing outweighs: aisles are alike. What scans say, ranges alone
+        outweigh: furniture was moved, and no other building has anchors of these names at these distances.
         """
-        against = self.total < 0.0 or min(self.scans, self.ranges) < -CERTAIN
+        against = self.total < 0.0 or self.ranges < -CERTAIN or self.scans < -max(CERTAIN, self.ranges)
         if against and self.ranges < self.scans:
             return f"the ranges fit the anchors nowhere (best place: {self.share:.0%} of them); is this the right map?"
         return "the scans fit the walls nowhere well; is this the right map?" if against else ""
