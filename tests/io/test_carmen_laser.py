@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uwblite.io.carmen import LogReader
-from uwblite.io.carmen_laser import decode_equal_widths
+from uwblite.io.carmen_laser import LaserMessages, decode_equal_widths
 
 
 @given(st.integers(1, 6), st.integers(1, 2), st.lists(st.integers(0, 10**8 - 1), min_size=6, max_size=6), st.booleans())
@@ -81,6 +81,25 @@ def test_poses_of_messages_that_are_read_together_have_the_numbers_of_their_line
     np.testing.assert_array_equal(poses, [[k, k + 0.5, k + 0.25, 0.5] for k in range(1, 8)])
     (scans,) = reader.laser._scans.values()
     assert list(scans.numbers) == [2, 5, 9, 13]
+
+
+def test_scans_that_are_written_alike_are_taken_together(monkeypatch):
+    """One by one they are read at a fraction of the speed."""
+    take, alone = LaserMessages.take, []
+
+    def counted(own, name, number, words):
+        alone.append(number)
+        take(own, name, number, words)
+
+    monkeypatch.setattr(LaserMessages, "take", counted)
+    reader = LogReader("log", 1, 1.0)
+    line = b"FLASER 3 1.25 2.50 3.75 0 0 0 0 0 0 %d r %d\n"
+    reader.feed(b"ODOM 0 0 0 0 0 0 1 r 1\n" + line % (1, 1))
+    reader.feed(b"".join(line % (k, k) for k in range(2, 8)))
+    assert alone == [2]
+    (scans,) = reader.laser._scans.values()
+    assert list(scans.numbers) == list(range(2, 9))
+    np.testing.assert_array_equal(np.array(scans.ranges).reshape(-1, 3), 7 * [[1.25, 2.5, 3.75]])
 
 
 def test_a_message_that_ends_with_its_first_reading_is_too_short():
