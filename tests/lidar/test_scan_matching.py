@@ -31,7 +31,7 @@ def test_pair_points_are_spread_over_the_points_with_normals(seed, limit):
     for pair, cloud in enumerate(j):
         rows = listed(pairs, pair)
         own = np.flatnonzero((clouds.owner == cloud) & np.any(clouds.normals != 0.0, axis=1))
-        assert len(rows) == min(limit, len(own))
+        assert len(rows) == pairs.asked[pair].sum() == min(limit, len(own))
         assert np.isin(rows, own).all()
         assert len(np.unique(rows)) == len(rows)
         if len(rows):

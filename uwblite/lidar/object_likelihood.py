@@ -166,7 +166,7 @@ def matched_by_chance(raster: CloudRasters, pairs: CloudPairs, mean: Floats) -> 
         for found in correspondences(raster, pairs, mean + aside, PairPolicy.gate):
             matched[found.pairs] += found.good.sum(axis=1)
     chance = np.full(len(raster.clouds), beforehand / points)
-    chance[pairs.i] = matched / (len(sides) * (pairs.points >= 0).sum(axis=1) + points)
+    chance[pairs.i] = matched / (len(sides) * pairs.asked.sum(axis=1) + points)
     return chance
 
 

@@ -73,6 +73,11 @@ class CloudPairs(Table):
     def __len__(self) -> int:
         return len(self.i)
 
+    @property
+    def asked(self) -> Bools:
+        """(e, n) which of the points are a pair's own."""
+        return self.points != NOBODY
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairFactors(Table):

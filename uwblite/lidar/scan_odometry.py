@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, chunks, renumbered
+from ..arrays import Floats, Ints, chunks, renumbered
 from ..odometry.attached import ScanPoints
 from ..sensor_log import LaserScans, SensorMounting
 from . import clouds, scan_matching
@@ -90,9 +90,8 @@ def _in_sight(built: Clouds, pairs: CloudPairs, motion: Floats, scans: LaserScan
     at = se2.transform(se2.compose(T_laser_base, motion)[:, None], points.take(pairs.points, axis=0))
     bearing = se2.bearing(at) * (-1.0 if mounting.laser_flipped else 1.0)
     middle, half = 0.5 * (scans.angles[0] + scans.angles[-1]), 0.5 * abs(scans.angles[-1] - scans.angles[0])
-    asked: Bools = pairs.points >= 0
     seen = (np.abs(se2.wrap_angle(bearing - middle)) <= half) & (np.hypot(at[..., 0], at[..., 1]) <= reach[pairs.i, None])
-    few = (seen & asked).sum(axis=1) < ScanStepPolicy.least_in_sight * asked.sum(axis=1)
+    few = (seen & pairs.asked).sum(axis=1) < ScanStepPolicy.least_in_sight * pairs.asked.sum(axis=1)
     return replace(pairs, points=np.where(seen | few[:, None], pairs.points, -1))
 
 
