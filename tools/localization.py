@@ -276,9 +276,8 @@ def scaled(on: Bench, grid: OccupancyGrid, factor: float) -> Bench:
 def abroad(on: Bench, other: KnownMap) -> Bench:
     """Return the bench with the map of another building, whose anchors bear the same ids."""
     count = min(len(on.known.anchors.ids), len(other.anchors.ids))
-    fields = ("positions", "bias", "rise", "sigma", "bias_sigma")
-    parts = {name: getattr(other.anchors, name)[:count] for name in fields}
-    return replace(on, known=replace(other, anchors=replace(other.anchors, ids=on.known.anchors.ids[:count], **parts)))
+    there = other.anchors.only(other.anchors.ids[:count])
+    return replace(on, known=replace(other, anchors=replace(there, ids=on.known.anchors.ids[:count])))
 
 
 def certain(on: Bench, starts: int, uwb: bool, lidar: bool) -> tuple[int, int]:
