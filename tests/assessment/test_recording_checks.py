@@ -32,8 +32,21 @@ def without_scans(sound):
     return sound.without(lidar=True)
 
 
+SENSORS = {
+    "odometry": {"moves-across-heading", "slow-odometry"},
+    "radio": {"no-ranges", "few-in-reach", "one-anchor", "missed-ranges", "few-ranges", "spikes", "straight-path"},
+    "lidar": {"no-lidar", "empty-scans", "few-hits", "error-codes"},
+    "log": {"broken-lines", "reader", "refused", "odometry-alone"},
+}
+"""Findings, by the sensor to look at."""
+
+
 def texts(log, **options):
-    return [f"{f.severity}: {f.text}" for f in diagnose(log, **options).findings]
+    findings = diagnose(log, **options).findings
+    named = {kind: sensor for sensor, kinds in SENSORS.items() for kind in kinds}
+    assert [f.sensor for f in findings if f.kind in named] == [named[f.kind] for f in findings if f.kind in named]
+    assert all(f.sensor in ("odometry", "radio", "lidar") for f in findings if f.kind in ("silences", "equal-stamps"))
+    return [f"{f.severity}: {f.text}" for f in findings]
 
 
 def assert_named(log, rank, part, **options):

@@ -12,7 +12,7 @@ from uwblite.errors import ConfigError, FormatError
 from uwblite.io.bag_motion import no_odometry
 from uwblite.io.bag_sensors import RangeReadings, ScanReadings
 from uwblite.io.carmen import read_log
-from uwblite.io.carmen_words import Params, kinds_of, parse_head, places_behind
+from uwblite.io.carmen_words import Params, is_message_name, kinds_of, parse_head, places_behind
 from uwblite.io.corrected_log import write_graph_with_scans
 from uwblite.io.csv_table import read_csv
 from uwblite.io.formats import read_graph, refuse_existing
@@ -364,3 +364,12 @@ def test_parameters_of_a_log():
         second.take(words(f"PARAM {line} 0 h 0"))
     assert (second.get("laser_time_increment"), second.get("laser_range_min")) == (3e-4, None)
     assert second.mounting(None, 1).laser_flipped
+
+
+@pytest.mark.parametrize(
+    ("name", "could_be"),
+    [("A", False), ("AB", True), ("A1", True), ("1A", False), ("A_B-2", True), ("_", False), ("Ab", False), ("A.B", False),
+     (40 * "A", True), (41 * "A", False)],
+)  # fmt: skip
+def test_names_of_messages_are_capitals_of_two_to_forty(name, could_be):
+    assert is_message_name(name.encode()) == could_be
