@@ -23,6 +23,7 @@ from uwblite.odometry.wheels import (
     OdometryNoiseConfig,
     _neighbours,
     _scale,
+    by_stamps,
     displaced,
     drift_time,
     noise_at,
@@ -187,6 +188,49 @@ def test_jitter_of_stamps_shows_in_the_turns(jitter, outliers):
     measured = wheels.motion + np.column_stack([np.zeros((len(wheels), 2)), np.diff(turned) + noise])
     steps = RelativePoseEdges(wheels.i, wheels.j, measured, 10.0 * wheels.end_sqrt_information)
     assert stamp_jitter(wheels, steps, Graph(np.zeros((len(wheels) + 1, 3)))) == pytest.approx(jitter, rel=0.2, abs=0.01)
+
+
+def test_jitter_that_few_steps_leave_open_is_not_ruled_out():
+    """Beside noise of the turns that is as large: never none, and never far too much."""
+    found = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        rate = 0.5 * np.ones(40)
+        late = rng.standard_normal(41) * 0.1
+        wheels = replace(chained(np.zeros((41, 3)), np.full(3, 0.01)), motion=rate[:, None] * [0.0, 0.0, 1.0])
+        off = 0.5 * np.diff(late) + 0.1 * rng.standard_normal(40)
+        steps = RelativePoseEdges(wheels.i, wheels.j, wheels.motion + off[:, None] * [0, 0, 1], wheels.sqrt_information)
+        found.append(stamp_jitter(wheels, steps, Graph(np.zeros((41, 3)))))
+    assert min(found) > 0.02
+    assert 0.08 < np.sqrt(np.mean(np.square(found))) < 0.15
+
+
+def test_late_stamps_change_steps_by_the_motion_at_both_ends():
+    """A robot that changes its motion at every other scan; the covariance of 400 draws is right to about a tenth."""
+    rng, jitter = np.random.default_rng(3), 0.05
+    kinds = np.array([[0.4, 0.0, 0.9], [0.3, 0.0, -0.9], [0.0, 0.0, 0.6], [0.5, 0.0, 0.0]])
+    twists = kinds[np.repeat(rng.integers(0, 4, 20), 2)]
+    path = se2.chain(np.zeros(3), se2.exp(twists))
+
+    def at(stamps):
+        """Return poses (k, 3) where the twist is constant between whole seconds."""
+        whole = np.clip(np.floor(stamps).astype(int), 0, 39)
+        return se2.compose(path[whole], se2.exp(twists[whole] * (stamps - whole)[:, None]))
+
+    stamps = np.arange(1.0, 40.0)
+    wheels = replace(chained(at(stamps), np.full(3, 0.01)), duration=np.ones(38))
+    stated = by_stamps(wheels, Graph(at(stamps)), jitter)
+    exact, off = se2.between(at(stamps)[:-1], at(stamps)[1:]), np.zeros((400, 38, 3))
+    for draw in off:
+        late = at(stamps + jitter * rng.standard_normal(39))
+        draw[:] = se2.between(late[:-1], late[1:]) - exact
+    found = np.einsum("nei,nej->eij", off, off) / len(off)
+    # Of the first step and the last, one neighbour is unknown.
+    trace = np.einsum("eii->e", stated[1:-1])[:, None, None] + 1e-4 * jitter**2
+    np.testing.assert_allclose((found - stated)[1:-1] / trace, 0.0, atol=0.25)
+    total = stated.sum(axis=0)
+    np.testing.assert_allclose(found.sum(axis=0), total, atol=0.03 * np.trace(total))
+    assert by_stamps(wheels.rows(slice(0, 0)), Graph(np.zeros((1, 3))), jitter).shape == (0, 3, 3)
 
 
 def test_a_slip_and_steps_that_are_off_in_a_row_are_no_late_scan():

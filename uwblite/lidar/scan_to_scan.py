@@ -12,15 +12,16 @@ import numpy as np
 from scipy.special import chdtri, logit
 
 from .. import se2
-from ..arrays import OUTLIER, TINY, Bools, Floats, Ints
+from ..arrays import OUTLIER, Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..odometry.slips import covariance_of, lost_sigma, posterior, spin_sigma, with_slips
-from ..odometry.wheels import displaced, reestimate_wheel_noise, stamp_jitter
+from ..odometry.wheels import by_stamps, displaced, reestimate_wheel_noise, stamp_jitter
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .object_likelihood import ObjectLikelihood
 from .registration import (
+    Gaussian,
     Placed,
     Placement,
     Prior,
@@ -137,9 +138,7 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
     pairs, mean = pairs_of(raster.clouds, i, i + 1), noise.corrected(graph)
     objects = ObjectLikelihood.of(raster, sigma, pairs, mean)
     objects = objects.learnt(pairs.rows(steps.enough), steps.pose[steps.enough])
-    # The stamps of both scans err.
-    by_stamps = np.sqrt(2.0) * stamp_jitter(wheels, certain, graph) * mean / np.maximum(noise.duration, TINY)[:, None]
-    covariance = covariance_of(noise, graph) + by_stamps[:, :, None] * by_stamps[:, None, :]
+    covariance = covariance_of(noise, graph) + by_stamps(noise, graph, stamp_jitter(wheels, certain, graph))
     prior = Prior.about(mean, covariance, spin_sigma(noise), lost_sigma(noise))
     found = register(objects, pairs, prior, steps.pose)
     # Where ranges are few, the path follows the wheels: that no slip shows there is no evidence against one.
@@ -165,7 +164,7 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
     captured = np.flatnonzero(doubtful & ~choice.elsewhere & (tempting.share > sound.share))
     own = np.flatnonzero(~doubtful[np.searchsorted(i, certain.i)])
     matched = certain.rows(own).followed_by(_as_edges(i, tempting, captured, variance))
-    rejected = _contradicted(matched, noise, graph) & ~choice.elsewhere & (~good | (alone < 0.0))
+    rejected = _contradicted(matched, noise.i, prior.sound) & ~choice.elsewhere & (~good | (alone < 0.0))
     rejected &= ~_taken_back(matched, noise, graph)
     own = own[~rejected[np.searchsorted(i, certain.i[own])]]
     edges = certain.rows(own).followed_by(_as_edges(i, mode, np.flatnonzero(doubtful & mode.shown & ~rejected), variance))
@@ -176,15 +175,15 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
     )
 
 
-def _contradicted(edges: RelativePoseEdges, wheels: OdometryEdges, graph: Graph) -> Bools:
-    """Return over which steps (e,) of the odometry measured edges contradict it, in the directions that these measure."""
-    own, turn = np.searchsorted(wheels.i, edges.i), se2.rotation(edges.T_i_j[:, 2])
-    by_wheels = np.swapaxes(turn, 1, 2) @ covariance_of(wheels, graph)[own] @ turn
-    off = se2.between(edges.T_i_j, wheels.corrected(graph)[own])
-    squared = squared_distance(off, by_wheels, edges.sqrt_information)
+def _contradicted(edges: RelativePoseEdges, first: Ints, wheels: Gaussian) -> Bools:
+    """Return over which steps (e,) of wheels, from keyframes first (e,), measured edges contradict them, in the directions that
+    these measure."""
+    own, turn = np.searchsorted(first, edges.i), se2.rotation(edges.T_i_j[:, 2])
+    by_wheels = np.swapaxes(turn, 1, 2) @ wheels.covariance[own] @ turn
+    squared = squared_distance(se2.between(edges.T_i_j, wheels.mean[own]), by_wheels, edges.sqrt_information)
     # Single steps also hold the errors that telescope, which the wheels' noise leaves out.
     usual = max(float(np.median(squared)) / TrackingConfig.median, 1.0) if len(squared) else 1.0
-    contradicted = np.zeros(len(wheels), dtype=bool)
+    contradicted = np.zeros(len(first), dtype=bool)
     contradicted[own[squared > usual * RegistrationConfig.contradicts]] = True
     return contradicted
 

@@ -1,5 +1,6 @@
 """Odometry edges, their noise and the scale of their turns, from the settings and from the recording."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -130,7 +131,8 @@ def stamp_jitter(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) 
     """Return the standard deviation of the scans' stamps, s, by what they add to one step and take from the next.
 
     A stamp late by t between two steps, at a turn rate w, changes the turns by the wheels over them by w t and -w t. So the
-    residuals r and s of steps that turn alike have var((r - s) / w) - var((r + s) / w) = 4 var(t).
+    residuals r and s of steps that turn alike have var((r - s) / w) - var((r + s) / w) = 4 var(t). Where few steps leave that
+    open, the expected variance counts: the mean of a normal distribution that is cut off at 0.
 
     Parameters
     ----------
@@ -145,7 +147,39 @@ def stamp_jitter(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) 
         return 0.0
     mean = 0.5 * (rate[first] + rate[first + 1])
     apart, together = (spread((off[first] + sign * off[first + 1]) / mean) for sign in (-1.0, 1.0))
-    return float(0.5 * np.sqrt(max(apart**2 - together**2, 0.0)))
+    variance, error = 0.25 * (apart**2 - together**2), 0.25 * np.hypot(apart**2, together**2) * np.sqrt(_OF_SPREAD / len(first))
+    z = max(float(variance / max(error, TINY)), -_SURELY)
+    density, below = math.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi), 0.5 * math.erfc(-z / math.sqrt(2.0))
+    return float(np.sqrt(error * (z + density / below)))
+
+
+_SURELY = 30.0
+"""Standard deviations below 0 beyond which nothing is left of a normal distribution cut off at 0."""
+_OF_SPREAD = 5.44
+"""Variance of the square of a robust standard deviation of n values, by its fourth power and by 1 / n: 4 of 1.36 / n."""
+
+
+def by_stamps(wheels: OdometryEdges, graph: Graph, jitter: float) -> Floats:
+    """Return the covariance (e, 3, 3) of steps between scans whose stamps err, by x, y and heading in the frame of pose i.
+
+    A late stamp adds what the robot moves meanwhile. At a scan it moves as over the step before or the one after: a robot that
+    turns back within a step turns fast at both ends of it.
+
+    Parameters
+    ----------
+    wheels : edges between neighbouring poses, in the order of the poses. jitter : standard deviation of the stamps, s.
+    """
+    if not len(wheels):
+        return np.zeros((0, 3, 3))
+    motion = wheels.corrected(graph)
+    late = jitter * se2.log(motion) / np.maximum(wheels.duration, TINY)[:, None]
+    over = late[:, :, None] * late[:, None, :]
+    at = 0.5 * (np.concatenate([over[:1], over]) + np.concatenate([over, over[-1:]]))
+    # A turn before the step turns the whole step.
+    before, after = np.tile(np.eye(motion.shape[1]), (len(motion), 1, 1)), se2.rotation(motion[:, 2])
+    before[:, 0, 2], before[:, 1, 2] = -motion[:, 1], motion[:, 0]
+    both = (matrix @ part @ np.swapaxes(matrix, 1, 2) for matrix, part in ((before, at[:-1]), (after, at[1:])))
+    return np.asarray(sum(both))
 
 
 def displaced(off: Floats) -> Bools:
