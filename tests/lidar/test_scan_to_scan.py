@@ -124,6 +124,28 @@ def test_of_steps_called_slipped_with_a_probability_that_share_slipped():
     assert np.mean(np.concatenate(squared) < 16.27) > 0.99
 
 
+@pytest.mark.parametrize("times", [15.0, 40.0])
+def test_long_steps_of_uncertain_wheels_are_measured_where_clouds_fit(times):
+    """Among posts, half a metre wide, descent from wheels that are off by two standard deviations ends at a false place."""
+    truth, rng = walked(5, HALL, 30.0)[0], np.random.default_rng(6)
+    middles, half = rng.uniform(-8.0, 8.0, (60, 2)), se2.rotate(rng.uniform(0.0, np.pi, 60), np.tile([0.25, 0.0], (60, 1)))
+    sides = np.hstack([middles - half, middles + half])
+    clouds = scanned(truth, np.concatenate([sides, sides[:, [2, 3, 0, 1]]]), 0.01, 5, reach=4.0)
+    exact = se2.between(truth[:-1], truth[1:])
+    long = np.arange(6, len(exact) - 3, 8)
+    noise = np.tile(NOISE, (len(exact), 1))
+    noise[long] *= times
+    stated = exact + rng.standard_normal(exact.shape) * NOISE
+    stated[long] += rng.choice([-1.0, 1.0], (len(long), 3)) * [1.5, 1.5, 2.0] * noise[long]
+    wheels = replace(chained(truth, NOISE), motion=stated, sqrt_information=np.eye(3) / noise[:, :, None])
+    raster = rasterize(clouds, 0.1, GATE)
+    found = follow(raster, wheels, Graph(se2.chain(truth[0], stated)), match_plainly(raster, wheels.i, stated, GATE))
+    measured = long[np.isin(long, found.steps.i)]
+    error = se2.between(exact[measured], found.steps.T_i_j[np.searchsorted(found.steps.i, measured)])
+    assert np.sum(np.abs(error).max(axis=1) < 0.03) >= len(long) - 1
+    assert found.slips[long].max() < 0.5
+
+
 def test_a_lost_message_is_told_by_the_clouds_before(walk):
     """Over one step of 10 ms the odometry misses 0.7 rad, more than any slip may last; the others are right."""
     truth, clouds, exact = walk

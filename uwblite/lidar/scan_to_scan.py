@@ -158,7 +158,7 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
     alone[doubtful] = log_odds[doubtful] = choice.log_odds
     slips = posterior(log_odds + by_others, wheels.duration).probability
     slipped = with_slips(noise, slips)
-    variance, sound, mode = sigma**2 * PairPolicy.correlation, found.sound, choice.placed
+    variance, sound, mode = sigma**2 * PairPolicy.correlation, found.likeliest(prior.sound)[0], choice.placed
     # What captures matching, a crowd or the ground before a robot that tilts, is less likely than where the wheels count it.
     tempting = found.candidates.rows(found.best(found.candidates.share))
     captured = np.flatnonzero(doubtful & ~choice.elsewhere & (tempting.share > sound.share))
@@ -239,8 +239,9 @@ def _decided(
         log_odds[number] = score[0].max()
         score += odds[:, row, None]
         best = int(np.argmax(score.max(axis=0)))
-        if score[:, best].max() > 0.0:
-            moved[row], choice[row], chain[row] = True, own[best], some.pose[best]
+        moved[row] = score[:, best].max() > 0.0
+        best = best if moved[row] else int(np.argmax(sound[0]))
+        choice[row], chain[row] = own[best], some.pose[best]
         tied[row] = found.candidates.rows(choice[row : row + 1]).shown[0]
     return found, _Choice(found.candidates.rows(choice), moved, log_odds)
 
