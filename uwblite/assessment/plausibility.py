@@ -39,8 +39,6 @@ _WRONG_TURNS, _SLIPS_AT_MOST = 0.25, 0.4
 large. Wheels that slip count too much, never too little: skid steering as if its track were wider, by two thirds at most."""
 _ONE_TIME = 30.0
 """Moves within so much of each other count as simultaneous, s."""
-SAME_PLACE = 1.5
-"""m; an anchor nearer than this to the former place of another one took its place, or only its name."""
 _POOR_FIT = 4.0
 """chi2 per degree of freedom beyond which errors are twice the assumed noise: the model is not valid."""
 
@@ -140,7 +138,7 @@ def check_anchors(anchors: Sequence[AnchorEstimate]) -> Iterator[Finding]:
 
 
 def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Floats], task: Task) -> Iterator[Finding]:
-    """Doubt a map in which half of the anchors changed at one time, unless they changed places only.
+    """Doubt a map in which half of the anchors changed at one time.
 
     Swapped wheels, a changed radio or clock, or a lidar that displaces the trajectory have the same effect. With a lidar,
     a single anchor may have been moved, and between recordings all of them.
@@ -157,9 +155,7 @@ def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Flo
         both = set(base[early].tolist()) & set(base[late].tolist())
         changed = {names[k][0] for k in these}
         enough = len(changed) >= max(0.5 * len(both), 2 if lidar else min(2, len(both)))
-        others = [(names[k][0], a.position) for k, a in enumerate(anchors) if names[k][1] == 1]
-        near = [[np.hypot(*(anchors[k].position - p)) < SAME_PLACE for n, p in others if n != names[k][0]] for k in these]
-        if enough and not all(any(each) for each in near):
+        if enough:
             when = float(start - task.recordings.stamps[0])
             likelier = "an error of lidar, radio or clocks is likelier"
             if not lidar:
