@@ -143,6 +143,15 @@ def test_names_exchanged_half_way_are_named():
     assert np.mean(undone.ranges.anchor == radio.anchor) > 0.98
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_heading_that_is_stuck_exchanges_no_names(seed):
+    """An exchange of two of four anchors explains a turn that the heading misses nearly as well."""
+    log = redriven(late_by(0.0, seed), 60.0, 120.0, lambda steps: steps * np.array([1.0, 1.0, 0.0]))
+    undone, facts = explained_by_ranges(log)
+    assert {fact.kind for fact in facts} == {"wheels-against-ranges"}
+    np.testing.assert_array_equal(undone.ranges.anchor, log.ranges.anchor)
+
+
 def test_names_exchanged_for_a_time_are_exchanged_back_twice():
     log = late_by(0.0)
     radio = log.ranges

@@ -126,8 +126,8 @@ def _with_names_undone(log: SensorLog, rows: list[Explanation]) -> tuple[SensorL
     of two explanations of the same readings shows in what either leaves.
     """
     tried = list[Explanation]()
-    while left := [row for row in rows if row.names and row.log_odds > EvidencePolicy.very_strong and row not in tried]:
-        row = max(left, key=lambda row: row.log_odds)
+    while exchanges := [row for row in _likeliest(rows) if row.names and row not in tried]:
+        row = max(exchanges, key=lambda row: row.log_odds)
         tried.append(row)
         near, undone = [other for other in rows if other.meets(row)], _with_names_back(log, row)
         left = _at_moments(undone, _traces(undone), row, to_compare=True)
@@ -136,6 +136,14 @@ def _with_names_undone(log: SensorLog, rows: list[Explanation]) -> tuple[SensorL
             rows, log = [row, *left, *(other for other in rows if other not in near)], undone
             tried.append(row)
     return log, rows
+
+
+def _likeliest(rows: Sequence[Explanation]) -> list[Explanation]:
+    """Return the likeliest row of each moment, where there is very strong evidence for it."""
+    best = dict[float, Explanation]()
+    for row in rows:
+        best[row.begin] = max(best.get(row.begin, row), row, key=lambda row: row.log_odds)
+    return [row for row in best.values() if row.log_odds > EvidencePolicy.very_strong]
 
 
 def _with_names_back(log: SensorLog, row: Explanation) -> SensorLog:
