@@ -67,6 +67,14 @@ def test_without_lidar_ranges_show_that_wheels_stand_still_and_the_map_is_doubte
     assert kinds(done, doubts=True) == {"wheels-stand-still"}
 
 
+def test_ranges_do_not_accuse_wheels_that_the_lidar_confirms(sound):
+    """All ranges become 2 m longer in the middle: no path of the wheels fits, and only a lidar shows that it is right."""
+    middle = sound.ranges.stamps.mean()
+    log = replace(sound, ranges=replace(sound.ranges, ranges=sound.ranges.ranges + 2.0 * (sound.ranges.stamps > middle)))
+    assert "wheels-against-ranges" in kinds(screen(log.without(lidar=True)))
+    assert "wheels-against-ranges" not in kinds(screen(log))
+
+
 def test_ranges_show_it_as_well_while_the_lidar_is_silent(sound):
     log = frozen(sound, 130.0, 150.0)
     silent = replace(log, scans=log.scans.rows((log.scans.stamps < 120.0) | (log.scans.stamps > 160.0)))

@@ -11,6 +11,7 @@ from helpers.room_recording import two_rounds
 from helpers.told import told
 
 from uwblite import se2
+from uwblite.problem.alternatives import EvidencePolicy
 from uwblite.screening import wheel_motion
 from uwblite.screening.wheel_motion import (
     PairPolicy,
@@ -155,6 +156,16 @@ def pairs(count=100, way=0.1, turn=0.0, **more):
     given = {"start": start, "end": start + 0.5, "lidar": wheels.copy(), "wheels": wheels, "share": np.ones(count)}
     given["information"] = alike(count, 3)
     return Pairs(**{**given, **more})
+
+
+def test_the_lidar_is_for_or_against_the_wheels_where_scans_measure_the_way():
+    way = np.where(np.arange(100) < 50, 0.1, 0.3)
+    wheels = np.column_stack([way, np.zeros((100, 2))])
+    lidar = np.where((np.arange(100) < 70)[:, None], wheels, 0.1 * np.eye(3)[1])
+    for shown in (True, False):
+        found = pairs(wheels=wheels, lidar=lidar, information=alike(100, 3) * shown)
+        assert (found.against_wheels(0.0, 40.0) < -EvidencePolicy.very_strong) == shown
+        assert (found.against_wheels(70.0, 100.0) > EvidencePolicy.very_strong) == shown
 
 
 def test_only_pairs_within_a_time_that_match_measure_it():

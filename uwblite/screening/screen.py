@@ -6,6 +6,7 @@ import numpy as np
 
 from ..findings import Fact
 from ..odometry.gyro import heading_from_gyro
+from ..problem.alternatives import EvidencePolicy
 from ..sensor_log import Odometry, OdometryBreaks, Screening, SensorLog
 from . import clocks, cuts, directions, odometry_chain, range_motion, repeats, units, wheel_motion
 from .odometry_chain import SAME_MOTION, unmeasured
@@ -73,9 +74,17 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     if pairs is not None:
         facts += wheel_motion.unmatched(pairs) + wheel_motion.disagreeing(pairs, float(log.odometry.stamps[0]), log)
         ratio = pairs.way_ratio
+        facts = [fact for fact in facts if not _refuted(fact, pairs, float(log.odometry.stamps[0]))]
     facts += _hardly_moving(log.odometry)
     breaks = OdometryBreaks.of_all([jumps, gaps, lost, cut])
     return replace(log, screening=Screening(tuple(facts), breaks, ratio, bursts))
+
+
+def _refuted(fact: Fact, pairs: Pairs, start: float) -> bool:
+    """Return whether the lidar shows that wheels are right which ranges contradict all along a stretch."""
+    lasting = fact.kind == "wheels-against-ranges" and fact.figures["what"] in ("turns", "mirrored")
+    begin, end = (start + fact.figures[name] for name in ("begin", "end")) if lasting else (start, start)
+    return lasting and pairs.against_wheels(begin, end) < -EvidencePolicy.very_strong
 
 
 def _hardly_moving(odometry: Odometry) -> list[Fact]:

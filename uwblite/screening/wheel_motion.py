@@ -180,12 +180,25 @@ class Pairs(Table):
         """The way by the lidar / the way by the wheels; nan where there are too few clear motions."""
         return _NAN if self.unrelated else self.rows(self.measured)._lidar_by_wheels(_PARTS[0], PairPolicy.clear, _NAN)
 
+    def against_wheels(self, start: float, end: float) -> float:
+        """Return the log odds of the lidar's motions between two times, s, being others than the wheels'.
+
+        Only those count whose way scans measure.
+        """
+        ways = self.wheels[:, _PARTS[0]]
+        shown = np.einsum("ei,eij,ej->e", ways, self._information(_PARTS[0]), ways) > PairPolicy.noise**2
+        own, count = self.rows(self.measured), (self.within(start, end) & shown)[self.measured]
+        return float(_of_another_time(own.lidar, own.scaled)[count].sum())
+
     def _lidar_by_wheels(self, part: slice, clear: float, otherwise: float) -> float:
         """Return how many times as large as the wheels' the ways or turns by the lidar are; see lidar_by_wheels."""
+        return lidar_by_wheels(self.wheels[:, part], self.lidar[:, part], clear, otherwise, self._information(part))
+
+    def _information(self, part: slice) -> Floats:
+        """Return the information (e, d, d) about the lidar's ways or turns, the other unknown."""
         rest = np.delete(np.arange(3), part)
         of_part, cross, of_rest = (self.information[:, i][:, :, k] for i, k in ((part, part), (part, rest), (rest, rest)))
-        known = of_part - cross @ np.linalg.pinv(of_rest, hermitian=True) @ np.swapaxes(cross, 1, 2)
-        return lidar_by_wheels(self.wheels[:, part], self.lidar[:, part], clear, otherwise, known)
+        return np.asarray(of_part - cross @ np.linalg.pinv(of_rest, hermitian=True) @ np.swapaxes(cross, 1, 2))
 
 
 def standing(odometry: Odometry, least: float = PairPolicy.least_stand) -> list[tuple[float, float]]:
