@@ -89,13 +89,18 @@ def test_an_anchor_disagrees_in_one_recording_while_others_whose_clocks_show_the
     (wrong_from(4), {"lidar": True}, False), (wrong_from(4, since=200), {"lidar": True}, True),
     (wrong_from(0), {"statuses": ("ok", "ok", "ok", "distrusted")}, False),
     (wrong_from(1), {"statuses": ("ok", "ok", "ok", "distrusted")}, True),
+    (wrong_from(0), {"statuses": ("distrusted",) * 4, "lidar": True}, True),
+    (wrong_from(0), {"statuses": ("distrusted",) * 3 + ("ok",), "lidar": True}, False),
+    (wrong_from(0), {"statuses": ("distrusted",) * 4, "lidar": True, "starts": (0.0, 0.0)}, False),
+    (wrong_from(0, 5), {"statuses": ("distrusted",) * 3 + ("ok", "ok"), "lidar": True}, True),
+    (wrong_from(0, 2), {"statuses": ("distrusted",) * 2, "lidar": True}, False),
     (wrong_from(0), {"statuses": ("ok", "ok", "distrusted", "unplaced")}, False),
     (wrong_from(0), {"statuses": ("ok", "unplaced", "distrusted", "unplaced")}, True),
     (wrong_from(1, 5), {}, True), (wrong_from(0, 5), {}, False),
     (wrong_from(0, 5), {"statuses": ("ok", "ok", "ok", "distrusted", "distrusted")}, False),
 ])  # fmt: skip
 def test_ranges_that_contradict_the_map_are_a_doubt(agrees, options, found):
-    """Most of all, or without a lidar those of half of the anchors; the fifth is the fourth after a move: one anchor."""
+    """Most of all, without a lidar those of half of the anchors, with one of all; the fifth is the fourth after a move."""
     assert [n.kind for n in told(agrees, **options) if n.severity == "doubt"] == ["ranges-disagree"] * found
 
 

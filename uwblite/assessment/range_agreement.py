@@ -44,11 +44,14 @@ def check_range_agreement(anchors: Sequence[AnchorEstimate], table: dict[str, Fl
     """Warn of each anchor whose ranges disagree with the map for long; doubt a map that most ranges contradict.
 
     A line of sight was blocked, or an anchor was moved. Without a lidar, ranges alone determine the path: half of the anchors
-    that disagree, or are distrusted, are a doubt as well. An anchor that was moved counts once.
+    that disagree, or are distrusted, are a doubt as well; with one, where none is left that is neither distrusted nor moved. An
+    anchor that was moved counts once.
     """
     placed = [a for a in anchors if a.status != "unplaced"]
     of_place = {a.id: name_and_number(a.id)[0] for a in placed}
     wrong = {of_place[a.id] for a in placed if a.status == "distrusted"}
+    moved = {name for name, number in map(name_and_number, of_place) if number > 1}
+    none_left = len(wrong | moved) == len(set(of_place.values())) >= _ENOUGH
     for finding in _outliers(anchors, table, task) if table else ():
         yield finding
         wrong |= {of_place[finding.anchor]} if finding.anchor in of_place else set()
@@ -59,9 +62,12 @@ def check_range_agreement(anchors: Sequence[AnchorEstimate], table: dict[str, Fl
             "the trajectory is wrong; check the anchors' ids, and the unit and the clock of the radio"
         )
         yield doubt("ranges-disagree", text, share=agreeing / count)
-    moved = {name for name, number in map(name_and_number, of_place) if number > 1}
     bad, heard = len(wrong | moved), len(set(of_place.values()))
-    if (wrong or bad > 1) and 2 * bad >= heard and not task.recordings.have_scans:
+    if task.recordings.have_scans:
+        if none_left and len(task.recordings.each) == 1:
+            text = f"all {heard} anchors were moved or are distrusted: no distances to anchors are likelier; check the radio"
+            yield doubt("ranges-disagree", text, disagreeing=bad, heard=heard)
+    elif (wrong or bad > 1) and 2 * bad >= heard:
         text = (
             f"{bad} of {heard} anchors were moved, disagree for long, or are distrusted, and only ranges and odometry "
             "constrain the trajectory: a wrong one is likelier than so many bad anchors, and the others may be too few; check "
