@@ -208,6 +208,8 @@ def test_an_open_page_is_asked_for_by_address():
     [
         ("GET / HTTP/1.1\r\nHost: {host}\r\nContent-Length: 4", "abcd"),
         ("GET / HTTP/1.1\r\nHost: {host}\r\nHost: elsewhere", ""),
+        ("GET / HTTP/1.1\r\nHost: {host}\r\nContent-Length : 4", "abcd"),
+        ("GET / HTTP/1.1\r\nHost: {host}\r\nno header\r\nOrigin: http://elsewhere", ""),
         ("GET / HTTP/1.1\r\nHost: {host}\r\nTransfer-Encoding: chunked", "0\r\n\r\n"),
         ("HEAD / HTTP/1.1\r\nHost: {host}\r\nContent-Length: x", ""),
         ("POST /closure HTTP/1.1\r\nHost: {host}\r\nContent-Length: 2\r\nContent-Length: 2", "{}"),

@@ -236,7 +236,9 @@ class _Handler(BaseHTTPRequestHandler):
     do_POST = do_HEAD = do_PUT = do_DELETE = do_OPTIONS = do_GET
 
     def _fault(self, empty: bool) -> str:
-        """Return why the head of a request cannot be trusted (RFC 9112, sections 3.2 and 6.3), "" where it can."""
+        """Return why the head of a request cannot be trusted (RFC 9112, sections 3.2, 5.1 and 6.3), "" where it can."""
+        if self.headers.defects:  # what follows such a line was not read as headers
+            return "a line of the head is no header"
         for name in ("Host", "Content-Length"):
             if len(self.headers.get_all(name, ())) > 1:
                 return f"more than one {name}"
