@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from ..arrays import Floats
 from ..errors import UsageError
 from ..io.log_parts import GrowingFile
 from ..io.source import open_input
@@ -133,12 +132,12 @@ def line_of(state: LocalizerState) -> str:
     """Return a state as one line of JSON; numbers that are not known are null."""
     fields: dict[str, Any] = {
         "stamp": round(state.stamp, 6),
-        "pose": _rounded(state.pose),
+        "pose": _rounded(state.pose.tolist()),
         "covariance": [[float(f"{v:.4g}") for v in row] for row in state.covariance.tolist()],
         "quality": round(state.quality, 3),
         "lost": state.lost,
         "age": round(state.age, 1),
-        "odometry": _rounded(state.odometry),
+        "odometry": _rounded(state.odometry.tolist()),
     }
     if state.reason:
         fields["reason"] = state.reason
@@ -151,9 +150,9 @@ def line_of(state: LocalizerState) -> str:
     return json.dumps(console.plain(fields), allow_nan=False)
 
 
-def _rounded(pose: Floats) -> list[float] | None:
+def _rounded(pose: list[float]) -> list[float] | None:
     """Return a pose (3,) as a line has it: m, m, rad; None where it is not known."""
-    return [round(v, 5) for v in pose.tolist()] if math.isfinite(pose.sum()) else None
+    return [round(v, 5) for v in pose] if math.isfinite(sum(pose)) else None
 
 
 def tell_doubts(result: StoredResult) -> None:
