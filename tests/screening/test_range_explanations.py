@@ -152,6 +152,20 @@ def test_a_heading_that_is_stuck_exchanges_no_names(seed):
     np.testing.assert_array_equal(undone.ranges.anchor, log.ranges.anchor)
 
 
+@pytest.mark.parametrize("seed", [3, 25])
+def test_wheels_that_slip_three_times_exchange_no_names(seed):
+    """A turn among anchors in a square looks like an exchange of two of them, which leaves the other slips."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = planted.wander(rng, 60.0)
+    wheels = planted.odometry(stamps, truth, rng, scale=1.02, noise=0.01, turn_noise=0.01)
+    square = 5.4 * np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    log = SensorLog(wheels, planted.ranges(rng, stamps, truth, square, rate=1.0, sigma=0.05, outliers=0.05), None)
+    for begin, end, turn in ((38.0, 42.0, -1.7), (64.0, 66.0, 1.1), (80.0, 82.0, -0.8)):
+        each = turn / np.sum((stamps[1:] > begin) & (stamps[1:] <= end))
+        log = redriven(log, begin, end, lambda steps, each=each: steps + np.array([0.0, 0.0, each]))
+    np.testing.assert_array_equal(explained_by_ranges(log)[0].ranges.anchor, log.ranges.anchor)
+
+
 def test_names_exchanged_for_a_time_are_exchanged_back_twice():
     log = late_by(0.0)
     radio = log.ranges
@@ -232,6 +246,16 @@ def test_the_likelihood_of_ranges_along_a_path_is_that_of_the_best_place():
     best = -np.log(np.pi * 0.2 * (1.0 + (errors / 0.2) ** 2)).sum(axis=1)
     assert likely[0] + 1.5 * np.log(30) == pytest.approx(best.max(), abs=0.1)
     assert likely[1] < likely[0] - 10.0
+
+
+def test_a_short_reading_among_long_ones_is_an_error_like_any_other():
+    """One of 2 m to an anchor 21 m away; squares of ranges alone would give it a hundred times the weight of the others."""
+    rng = np.random.default_rng(0)
+    path = np.column_stack([np.linspace(0.0, 5.0, 13), 2.0 * np.sin(np.linspace(0.0, 2.0, 13))])
+    values = np.hypot(*(path - [16.0, 14.0]).T) + 0.05 * rng.standard_normal(13)
+    sound, one = (_best_place(path[None], of[None], np.ones((1, 13)))[1, 0] for of in (values, np.append(values[:-1], 2.0)))
+    # What a Cauchy error of 19 m costs more than one of a scale.
+    assert sound - one < np.log((1.0 + (19.5 / 0.2) ** 2) / 1.0)
 
 
 def test_the_density_of_changes_by_way_is_a_density():

@@ -131,7 +131,9 @@ def _with_names_undone(log: SensorLog, rows: list[Explanation]) -> tuple[SensorL
         tried.append(row)
         near, undone = [other for other in rows if other.meets(row)], _with_names_back(log, row)
         left = _at_moments(undone, _traces(undone), row, to_compare=True)
-        if _most(left) < min(_most(near) - EvidencePolicy.very_strong, row.log_odds):
+        gains = _most(left) < min(_most(near) - EvidencePolicy.very_strong, row.log_odds)
+        # Wheels that slip several times look like one exchange, which leaves the other slips.
+        if gains and all(other.names for other in _likeliest(left)):
             row = replace(row, figures=row.figures | {"undone": True})
             rows, log = [row, *left, *(other for other in rows if other not in near)], undone
             tried.append(row)
@@ -541,15 +543,20 @@ def _best_place_of_few(paths: Floats, ranges: Floats, counted: Floats) -> Floats
     many = counted.sum(axis=-1)
     middle = (counted[..., None, :] @ paths)[..., 0, :] / many[..., None]
     x, y = (-2.0 * (paths[..., k] - middle[..., k, None]) for k in (0, 1))
-    squares, twice = ranges**2 - 0.25 * (x**2 + y**2), 2.0 * np.maximum(np.abs(ranges), SHORTEST_RANGE)
+    measured, from_middle = np.maximum(np.abs(ranges), SHORTEST_RANGE), 0.25 * (x**2 + y**2)
+    squares = ranges**2 - from_middle
     rows = np.stack([x, y, np.broadcast_to(1.0, x.shape), squares], axis=-2)
-    unknown, sure = rows[..., :-1, :], counted / twice**2
-    weights = np.broadcast_to(sure, squares.shape)
+    unknown = rows[..., :-1, :]
+    # Of squares of two distances the difference is that of the distances times their sum; one of the two is yet unknown.
+    both = measured + np.einsum("...n,...n", measured, counted)[..., None] / many[..., None]
+    weights = np.broadcast_to(counted / both**2, squares.shape)
     for _ in range(PathPolicy.rounds):
         normal = (unknown * weights[..., None, :]) @ np.swapaxes(rows, -1, -2)
         found = np.linalg.solve(normal[..., :-1] + PathPolicy.ridge * np.eye(normal.shape[-2]), normal[..., -1:])
-        errors = ((np.swapaxes(found, -1, -2) @ unknown)[..., 0, :] - squares) / twice
-        weights = sure / (1.0 + (errors / PathPolicy.noise[1]) ** 2)
+        of_place = (np.swapaxes(found, -1, -2) @ unknown)[..., 0, :]
+        both = measured + np.sqrt(np.maximum(of_place + from_middle, 0.0))
+        errors = (of_place - squares) / both
+        weights = counted / (both**2 * (1.0 + (errors / PathPolicy.noise[1]) ** 2))
     scales = PathPolicy.noise.reshape(-1, *(1,) * (errors.ndim - 1))
     off = np.einsum("...n,...n", np.log(1.0 + (errors / scales[..., None]) ** 2), counted)
     return np.asarray(-off - many * np.log(np.pi * scales) - 1.5 * np.log(many))
