@@ -532,3 +532,13 @@ def test_where_nothing_holds_the_poses_the_noise_stays():
         truth, wheels = driven(steps, ASSUMED, 0.0, 0.0)
         found = noise_at(Graph(truth), wheels, np.tile(SURE, (len(truth), 1, 1)))
         np.testing.assert_array_equal(found.sqrt_information, wheels.sqrt_information)
+
+
+def test_stamps_that_are_nearly_the_same_add_no_more_than_the_motion():
+    """Scans of a burst are a microsecond apart; the steps between them are as large as others."""
+    poses = np.column_stack([np.arange(9) * 0.2, np.zeros(9), np.zeros(9)])
+    wheels = replace(chained(poses, np.full(3, 0.01)), duration=np.where(np.arange(8) % 2, 1e-6, 1.0))
+    covariance = by_stamps(wheels, Graph(poses), 0.05)
+    assert covariance[:, 0, 0].max() <= 2.0 * 0.2**2
+    assert covariance[:, 0, 0].min() > 0.0
+    assert not by_stamps(wheels, Graph(poses), 0.0).any()

@@ -227,3 +227,12 @@ def test_a_request_whose_end_is_in_doubt_is_refused_and_the_connection_closed(se
     assert answer.startswith(b"HTTP/1.1 400 ")
     assert answer.count(b"HTTP/1.1") == 1
     assert b"Connection: close" in answer
+
+
+def test_a_form_in_parts_is_a_request_like_any_other(served):
+    """Its body is in parts that only the header's type names; it has no token."""
+    _, server = served
+    head = f"POST /closure HTTP/1.1\r\nHost: 127.0.0.1:{server.server_address[1]}\r\nContent-Length: 2"
+    with socket.create_connection(server.server_address, timeout=10) as connection:
+        connection.sendall(f"{head}\r\nContent-Type: multipart/form-data\r\n\r\n{{}}".encode())
+        assert connection.recv(1 << 16).startswith(b"HTTP/1.1 403 ")

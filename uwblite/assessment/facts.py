@@ -240,8 +240,7 @@ TEXTS: Mapping[str, Text] = {
     "exchanged-names": Text(
         "from about t = {at:.0f} s on, or until then, the ranges do not fit the places of their anchors along the path by the "
         "wheels, but {exchanged:those of {anchors:list} fit the places of others|fit no places at all}"
-        "{undone:; from then on they were taken under those names|}: check the anchors' ids in the radio and in what reads "
-        "them",
+        ": check the anchors' ids in the radio and in what reads them",
         DOUBT,
         "radio",
     ),

@@ -65,7 +65,7 @@ def check_range_agreement(anchors: Sequence[AnchorEstimate], table: dict[str, Fl
     bad, heard = len(wrong | moved), len(set(of_place.values()))
     if task.recordings.have_scans:
         if none_left and len(task.recordings.each) == 1:
-            text = f"all {heard} anchors were moved or are distrusted: no distances to anchors are likelier; check the radio"
+            text = f"all {heard} anchors were moved or are distrusted: likelier, ranges are no distances; check the radio"
             yield doubt("ranges-disagree", text, disagreeing=bad, heard=heard)
     elif (wrong or bad > 1) and 2 * bad >= heard:
         text = (

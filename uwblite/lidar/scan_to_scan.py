@@ -16,7 +16,7 @@ from ..arrays import OUTLIER, Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..odometry.slips import covariance_of, lost_sigma, posterior, spin_sigma, with_slips
-from ..odometry.wheels import by_stamps, displaced, reestimate_wheel_noise, stamp_jitter
+from ..odometry.wheels import by_stamps, reestimate_wheel_noise, stamp_jitter
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .object_likelihood import ObjectLikelihood
@@ -165,7 +165,6 @@ def follow(raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Ste
     own = np.flatnonzero(~doubtful[np.searchsorted(i, certain.i)])
     matched = certain.rows(own).followed_by(_as_edges(i, tempting, captured, variance))
     rejected = _contradicted(matched, noise.i, prior.sound) & ~choice.elsewhere & (~good | (alone < 0.0))
-    rejected &= ~_taken_back(matched, noise, graph)
     own = own[~rejected[np.searchsorted(i, certain.i[own])]]
     edges = certain.rows(own).followed_by(_as_edges(i, mode, np.flatnonzero(doubtful & mode.shown & ~rejected), variance))
     edges = edges.rows(np.argsort(edges.i))
@@ -186,17 +185,6 @@ def _contradicted(edges: RelativePoseEdges, first: Ints, wheels: Gaussian) -> Bo
     contradicted = np.zeros(len(first), dtype=bool)
     contradicted[own[squared > usual * RegistrationConfig.contradicts]] = True
     return contradicted
-
-
-def _taken_back(edges: RelativePoseEdges, wheels: OdometryEdges, graph: Graph) -> Bools:
-    """Return over which steps (e,) of the odometry edges differ from it as those of the step before or after take back.
-
-    The stamp of the scan between both errs, or its cloud is displaced: either step alone would bend the path.
-    """
-    own, off = np.searchsorted(wheels.i, edges.i), np.zeros((len(wheels), edges.T_i_j.shape[1]))
-    off[own] = se2.between(wheels.corrected(graph)[own], edges.T_i_j)
-    scans = displaced(off)
-    return np.append(scans, False) | np.append(False, scans)
 
 
 def _as_edges(first: Ints, placed: Placed, rows: Ints, variance: float) -> RelativePoseEdges:

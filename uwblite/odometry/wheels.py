@@ -172,14 +172,18 @@ def by_stamps(wheels: OdometryEdges, graph: Graph, jitter: float) -> Floats:
     if not len(wheels):
         return np.zeros((0, 3, 3))
     motion = wheels.corrected(graph)
-    late = jitter * se2.log(motion) / np.maximum(wheels.duration, TINY)[:, None]
+    # However late, it adds no more than the step's own motion.
+    late = se2.log(motion) * (jitter / np.maximum(wheels.duration, max(jitter, TINY)))[:, None]
     over = late[:, :, None] * late[:, None, :]
-    at = 0.5 * (np.concatenate([over[:1], over]) + np.concatenate([over, over[-1:]]))
+    # Of the ends of a recording one neighbour is unknown.
+    follows = (wheels.i[1:] == wheels.j[:-1])[:, None, None]
+    earlier = np.concatenate([over[:1], np.where(follows, over[:-1], over[1:])])
+    later = np.concatenate([np.where(follows, over[1:], over[:-1]), over[-1:]])
     # A turn before the step turns the whole step.
     before, after = np.tile(np.eye(motion.shape[1]), (len(motion), 1, 1)), se2.rotation(motion[:, 2])
     before[:, 0, 2], before[:, 1, 2] = -motion[:, 1], motion[:, 0]
-    both = (matrix @ part @ np.swapaxes(matrix, 1, 2) for matrix, part in ((before, at[:-1]), (after, at[1:])))
-    return np.asarray(sum(both))
+    both = (matrix @ part @ np.swapaxes(matrix, 1, 2) for matrix, part in ((before, earlier + over), (after, over + later)))
+    return np.asarray(0.5 * sum(both))
 
 
 def displaced(off: Floats) -> Bools:

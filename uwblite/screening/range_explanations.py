@@ -22,6 +22,7 @@ from ..arrays import CHUNK, Bools, Floats, Ints, Table, chunks
 from ..findings import Fact
 from ..problem.alternatives import EvidencePolicy
 from ..sensor_log import SHORTEST_RANGE, SensorLog, plausible
+from . import wheel_motion
 from .units import LENGTHS
 
 
@@ -93,8 +94,7 @@ class Explanation:
 
 
 def explained_by_ranges(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
-    """Return the recording with the radio's clock and the anchors' names set right, where that explains its ranges best, and
-    what explains them."""
+    """Return the recording with the radio's clock set right, where that explains its ranges best, and what explains them."""
     traces = _traces(log)
     if not traces:
         return log, []
@@ -111,33 +111,39 @@ def explained_by_ranges(log: SensorLog) -> tuple[SensorLog, list[Fact]]:
         # A clock that is off contradicts the path at many moments; set right, at fewer.
         if _most(left) <= _most(moments):
             log, moments, delays = in_time, left, [*delays, Fact.of(late.kind, **late.figures)]
-    log, moments = _with_names_undone(log, moments)
-    return log, [*delays, *_facts(moments, log)]
+    return log, [*delays, *_facts(_without_consequences(log, moments), log)]
 
 
 def _most(rows: Sequence[Explanation]) -> float:
     return max((row.log_odds for row in rows), default=-np.inf)
 
 
-def _with_names_undone(log: SensorLog, rows: list[Explanation]) -> tuple[SensorLog, list[Explanation]]:
-    """Return the recording with names exchanged back, and the rows without those that the exchange explains: they are gone.
+def _without_consequences(log: SensorLog, rows: list[Explanation]) -> list[Explanation]:
+    """Return the rows without those that an exchange of names explains: with the names exchanged back they are no more.
 
     An exchange contradicts the path, too, at moments somewhat before it and after it, where it is on one side: what holds there
     of two explanations of the same readings shows in what either leaves.
     """
-    tried = list[Explanation]()
-    while exchanges := [row for row in _likeliest(rows) if row.names and row not in tried]:
-        row = max(exchanges, key=lambda row: row.log_odds)
-        tried.append(row)
-        near, undone = [other for other in rows if other.meets(row)], _with_names_back(log, row)
+    # Wheels that turn a robot among anchors that stand around it look like an exchange of names; a lidar tells the two apart.
+    if any(row.names for row in _likeliest(rows)) and (pairs := wheel_motion.compare(log)) is not None:
+        rows = [row for row in rows if not (row.names and pairs.wheels_fail(*_times(log, row)))]
+    for row in sorted((row for row in _likeliest(rows) if row.names), key=lambda row: -row.log_odds):
+        ranges, near = log.ranges, [other for other in rows if other.meets(row)]
+        assert ranges is not None
+        others = np.array([ranges.anchor_ids.index(row.names.get(name, name)) for name in ranges.anchor_ids], dtype=np.intp)
+        after = ranges.stamps > np.mean(_times(log, row))
+        undone = replace(log, ranges=replace(ranges, anchor=np.where(after, others[ranges.anchor], ranges.anchor)))
         left = _at_moments(undone, _traces(undone), row, to_compare=True)
-        gains = _most(left) < min(_most(near) - EvidencePolicy.very_strong, row.log_odds)
+        gains = row in rows and _most(left) < min(_most(near) - EvidencePolicy.very_strong, row.log_odds)
         # Wheels that slip several times look like one exchange, which leaves the other slips.
         if gains and all(other.names for other in _likeliest(left)):
-            row = replace(row, figures=row.figures | {"undone": True})
             rows, log = [row, *left, *(other for other in rows if other not in near)], undone
-            tried.append(row)
-    return log, rows
+    return rows
+
+
+def _times(log: SensorLog, row: Explanation) -> list[float]:
+    """Return the first and the last time of the stretch of a row, s."""
+    return np.interp([row.begin, row.end], log.odometry.travelled, log.odometry.stamps).tolist()
 
 
 def _likeliest(rows: Sequence[Explanation]) -> list[Explanation]:
@@ -146,23 +152,6 @@ def _likeliest(rows: Sequence[Explanation]) -> list[Explanation]:
     for row in rows:
         best[row.begin] = max(best.get(row.begin, row), row, key=lambda row: row.log_odds)
     return [row for row in best.values() if row.log_odds > EvidencePolicy.very_strong]
-
-
-def _with_names_back(log: SensorLog, row: Explanation) -> SensorLog:
-    """Return the recording with names exchanged back from the moment of a row's stretch on from which the ranges fit best."""
-    ranges, odometry = log.ranges, log.odometry
-    assert ranges is not None
-    others = np.array([ranges.anchor_ids.index(row.names.get(name, name)) for name in ranges.anchor_ids], dtype=np.intp)
-    best, most = log, -np.inf
-    for at in np.interp(np.arange(row.begin, row.end, PathPolicy.apart), odometry.travelled, odometry.stamps).tolist():
-        anchor = np.where(ranges.stamps > at, others[ranges.anchor], ranges.anchor)
-        other = replace(log, ranges=replace(ranges, anchor=anchor))
-        stretches = Stretches.of(_traces(other), np.array([row.begin]), np.array([row.end]))
-        # Of anchors with too few readings for a place these may be any numbers.
-        likely = float(stretches.likely.sum(axis=0).max() + np.log(ranges.ranges.max()) * stretches.counts.sum())
-        if likely > most:
-            best, most = other, likely
-    return best
 
 
 def _facts(rows: Sequence[Explanation], log: SensorLog) -> list[Fact]:
@@ -485,15 +474,15 @@ class Moment:
         one, two, count = self.before, self.after, len(self.names)
         to, gain = self.exchanged(small)
         names = {self.names[k]: name for k, name in zip(to, self.names, strict=True)}
-        changed = [name for k, name in zip(to, self.names, strict=True) if self.names[k] != name]
+        changed = list(dict.fromkeys(name for k, name in zip(to, self.names, strict=True) if self.names[k] != name))
         prior, kind = float(np.log(PathPolicy.fault)) - null, "exchanged-names"
         if changed:
             # The number of cycles of so many of the anchors.
             gain -= math.lgamma(count + 1.0) - math.lgamma(count - len(changed) + 1.0) - math.log(len(changed))
-            yield Explanation(gain + prior, kind, {"exchanged": True, "undone": False, "anchors": changed}, names=names)
+            yield Explanation(gain + prior, kind, {"exchanged": True, "anchors": changed}, names=names)
         number = -float(np.log(self.longest))
         nowhere = max(float(a.likely.sum(axis=0).max() + number * b.counts.sum()) for a, b in ((one, two), (two, one)))
-        yield Explanation(nowhere + prior, kind, {"exchanged": False, "undone": False, "anchors": changed})
+        yield Explanation(nowhere + prior, kind, {"exchanged": False, "anchors": changed})
 
 
 _WHEELS = "wheels-against-ranges"

@@ -84,7 +84,7 @@ def _refuted(fact: Fact, pairs: Pairs, start: float) -> bool:
     """Return whether the lidar shows that wheels are right which ranges contradict all along a stretch."""
     lasting = fact.kind == "wheels-against-ranges" and fact.figures["what"] in ("turns", "mirrored")
     begin, end = (start + fact.figures[name] for name in ("begin", "end")) if lasting else (start, start)
-    return lasting and pairs.against_wheels(begin, end) < -EvidencePolicy.very_strong
+    return lasting and pairs.against_wheels(begin, end) < -EvidencePolicy.very_strong and not pairs.wheels_fail(begin, end)
 
 
 def _hardly_moving(odometry: Odometry) -> list[Fact]:

@@ -190,6 +190,11 @@ class Pairs(Table):
         own, count = self.rows(self.measured), (self.within(start, end) & shown)[self.measured]
         return float(_of_another_time(own.lidar, own.scaled)[count].sum())
 
+    def wheels_fail(self, start: float, end: float) -> bool:
+        """Return whether there is very strong evidence for wheels that fail for a time between two times, s."""
+        own = self.rows(self.measured)
+        return bool(_likely_runs(_of_another_time(own.lidar, own.scaled)[self.within(start, end)[self.measured]]))
+
     def _lidar_by_wheels(self, part: slice, clear: float, otherwise: float) -> float:
         """Return how many times as large as the wheels' the ways or turns by the lidar are; see lidar_by_wheels."""
         return lidar_by_wheels(self.wheels[:, part], self.lidar[:, part], clear, otherwise, self._information(part))

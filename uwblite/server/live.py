@@ -190,6 +190,8 @@ def _pose_advice(state: LocalizerState) -> list[str]:
         advice = [f"the pose is {state.age:.0f} s old: no data; is the recorder still running?"]
     else:
         advice = [f"the pose is not known: {state.reason or 'drive on, past walls and anchors'}"] if state.lost else []
-        advice += [f"nothing from {name} for {age:.0f} s: {CONSEQUENCES[name]}" for name, age in state.silent.items()]
+        # A pose that is not known is not held.
+        silent = [(name, age) for name, age in state.silent.items() if not (state.lost and name == "odometry")]
+        advice += [f"nothing from {name} for {age:.0f} s: {CONSEQUENCES[name]}" for name, age in silent]
     moved = "has been moved since the map was made, or its line of sight is blocked"
     return advice + [f"anchor {name} {moved}" for name in state.moved_anchors]

@@ -20,6 +20,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from email.errors import FirstHeaderLineIsContinuationDefect, MissingHeaderBodySeparatorDefect
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -237,7 +238,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _fault(self, empty: bool) -> str:
         """Return why the head of a request cannot be trusted (RFC 9112, sections 3.2, 5.1 and 6.3), "" where it can."""
-        if self.headers.defects:  # what follows such a line was not read as headers
+        # What follows such a line was not read as headers; other defects are those of a body in parts.
+        if any(isinstance(defect, (FirstHeaderLineIsContinuationDefect, MissingHeaderBodySeparatorDefect))
+               for defect in self.headers.defects):
             return "a line of the head is no header"
         for name in ("Host", "Content-Length"):
             if len(self.headers.get_all(name, ())) > 1:
