@@ -239,8 +239,8 @@ TEXTS: Mapping[str, Text] = {
     ),
     "exchanged-names": Text(
         "from about t = {at:.0f} s on, or until then, the ranges do not fit the places of their anchors along the path by the "
-        "wheels, but {exchanged:those of {anchors:list} fit the places of others|fit no places at all}"
-        ": check the anchors' ids in the radio and in what reads them",
+        "wheels, but {exchanged:those of {anchors:list} fit the places of others|fit no places at all}: check the anchors' ids "
+        "in the radio and in what reads them",
         DOUBT,
         "radio",
     ),

@@ -28,7 +28,7 @@ _FIRST_PERIOD = 2.0
 """s, as long as a sensor's own is not known: that of a radio that measures at rest."""
 _FORGETTING = 0.05
 """Share of the longest period that every message forgets."""
-_NO_ODOMETRY = "no odometry has come in: without it there is no pose"
+NO_ODOMETRY = "no odometry has come in: without it there is no pose"
 _NAMED = 10
 """Most unknown anchors that are named."""
 
@@ -193,7 +193,7 @@ class LiveFeed:
         """Return a state with the silence of the sensors, where nothing at all has come for so long, s."""
         silent = self.silence.silent(quiet)
         if "odometry" in silent and not np.isfinite(state.stamp):
-            state = replace(state, stamp=self.silence.now, reason=_NO_ODOMETRY)
+            state = replace(state, stamp=self.silence.now, reason=NO_ODOMETRY)
         if not quiet:
             return replace(state, silent=silent) if silent else state
         drift = np.diag(np.square(np.minimum(UNSEEN_SPEED * quiet, (np.inf, np.inf, np.pi))))

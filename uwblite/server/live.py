@@ -13,7 +13,7 @@ import numpy as np
 
 from ..io.carmen_live import LogTail, Sensor
 from ..io.stored_result import StoredResult
-from ..localization.live_feed import CONSEQUENCES
+from ..localization.live_feed import CONSEQUENCES, NO_ODOMETRY
 from ..localization.pose_estimator import LocalizerState
 from ..report.drawn_map import ellipse
 from ..report.svg_map import map_svg
@@ -190,8 +190,8 @@ def _pose_advice(state: LocalizerState) -> list[str]:
         advice = [f"the pose is {state.age:.0f} s old: no data; is the recorder still running?"]
     else:
         advice = [f"the pose is not known: {state.reason or 'drive on, past walls and anchors'}"] if state.lost else []
-        # A pose that is not known is not held.
-        silent = [(name, age) for name, age in state.silent.items() if not (state.lost and name == "odometry")]
-        advice += [f"nothing from {name} for {age:.0f} s: {CONSEQUENCES[name]}" for name, age in silent]
+        # Where none has ever come there is no pose to be held.
+        silent = state.silent.keys() - ({"odometry"} if state.reason == NO_ODOMETRY else set())
+        advice += [f"nothing from {name} for {state.silent[name]:.0f} s: {CONSEQUENCES[name]}" for name in sorted(silent)]
     moved = "has been moved since the map was made, or its line of sight is blocked"
     return advice + [f"anchor {name} {moved}" for name in state.moved_anchors]
